@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sagesplat.core.errors import SceneError
-from sagesplat.demo import off_path
 from sagesplat.demo.cameras import demo_cameras
 from sagesplat.demo.capture import make_capture
 from sagesplat.demo.figures import PERSON
 from sagesplat.demo.off_path import APART, UNSEEN
-from sagesplat.demo.wild import POSES, Wild, camera_gains, kept_views, lens_falloff, noisy_cameras
+from sagesplat.demo.wild import Wild, noisy_cameras
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.nerfstudio import load_transforms
 
@@ -66,25 +64,9 @@ def test_each_disturbance_alone_leaves_the_truth(clean, tmp_path):
     assert fall[:, [0, 0, -1, -1], [0, -1, 0, -1]].mean() < 0.9
 
 
-def test_gains_have_no_mean_and_drift():
-    gains = np.log2(camera_gains(Wild(exposure=0.7, white_balance=0.2), 60, 3))
-    assert np.abs(gains.mean(0)).max() < 0.05
-    assert 0.55 < np.abs(gains[:, 1]).max() <= 0.7
-    drift = gains[:, 0] - gains[:, 1]
-    assert np.abs(drift).max() == pytest.approx(0.2)
-    assert np.abs(np.diff(drift)).mean() < 0.3 * drift.std() * np.pi
-
-
-def test_lens_loses_what_was_asked_in_the_corners():
-    camera = demo_cameras(3, 64, 48, 0)[0]
-    fall = lens_falloff(Wild(vignetting=0.4), camera)
-    assert fall[0, 0, 0] == pytest.approx(0.6, abs=0.01)
-    assert fall[24, 32, 0] == pytest.approx(1, abs=0.01)
-
-
 def test_pose_noise_has_the_size_that_was_asked():
     cameras = demo_cameras(400, 64, 48, 0)
-    noisy = noisy_cameras(POSES, cameras, 0)
+    noisy = noisy_cameras(Wild(pose_degrees=0.5, pose_shift=0.005), cameras, 0)
     turns = [n.w2c[:3, :3].astype(float) @ c.w2c[:3, :3].T for n, c in zip(noisy, cameras, strict=True)]
     angle = np.degrees([np.arcsin(np.linalg.norm(t - t.T) / np.sqrt(8)) for t in turns])
     assert np.sqrt(np.mean(angle**2)) == pytest.approx(0.5, rel=0.1)
@@ -113,12 +95,6 @@ def test_no_track_is_on_a_figure(wild):
     assert standing[points.track_views, row, column].mean() < 0.01  # features have noise
 
 
-def test_kept_views():
-    assert len(kept_views(Wild(keep=0.5), 60, 0)) == 30
-    assert list(kept_views(Wild(), 4, 0)) == [0, 1, 2, 3]
-    assert len(kept_views(Wild(keep=0.01), 60, 0)) == 3
-
-
 def test_off_path_pictures_show_what_the_photos_saw(wild):
     scene, path = load_transforms(wild / "truth/off_path", test_every=0), load_transforms(wild / "truth")
     seen = pictures(wild / "truth/off_path/seen") == 255
@@ -127,18 +103,3 @@ def test_off_path_pictures_show_what_the_photos_saw(wild):
     photos = np.stack([view.camera.position for view in path.views])
     for view in scene.views:
         assert np.linalg.norm(photos - view.camera.position, axis=1).min() >= APART - 1e-4
-
-
-def test_refusals(tmp_path, monkeypatch):
-    with pytest.raises(SceneError, match="below 0"):
-        Wild(exposure=-1)
-    with pytest.raises(SceneError, match="below 0"):
-        Wild(pose_shift=float("nan"))
-    with pytest.raises(SceneError, match="vignetting"):
-        Wild(vignetting=1)
-    with pytest.raises(SceneError, match="one place"):
-        make_capture(tmp_path / "grid", views=80, places=(2, 1), wild=POSES)
-    monkeypatch.setattr(off_path, "APART", 100.0)
-    with pytest.raises(SceneError, match=r"0 of 2 viewpoints .* draw more photos"):
-        make_capture(tmp_path / "few", views=3, width=32, height=24, wild=Wild(off_path=2))
-    assert list(tmp_path.iterdir()) == []

@@ -2,7 +2,6 @@
 
 import errno
 import hashlib
-import socket
 import threading
 from dataclasses import replace
 from functools import partial
@@ -12,7 +11,6 @@ import pytest
 import torch
 
 from sagesplat.core.errors import DataError, RunError
-from sagesplat.download import weights
 from sagesplat.download.weights import SOURCES, Source, download_lpips
 from sagesplat.metrics.lpips import Net, load_lpips, shapes
 
@@ -111,38 +109,22 @@ def test_files_that_are_there_stay(sources, tmp_path):
     assert path.stat().st_size == before.st_size
 
 
-def test_the_published_layers_are_convolutions():
-    """torchvision numbers convolutions, activations and poolings in one row."""
-    rows = {"alex": "cr p cr p cr cr cr p", "vgg": "cr cr p cr cr p cr cr cr p cr cr cr p cr cr cr p"}
-    for net, source in SOURCES.items():
-        layers = enumerate(rows[net].replace(" ", ""))
-        assert source.convolutions == tuple(i for i, layer in layers if layer == "c")
-        assert source.backbone.endswith(f"-{source.sha256[:8]}.pth")  # as torchvision names its files
-        assert len(source.sha256) == len(source.heads_sha256) == 64
-
-
 def test_failures_are_one_line_and_leave_nothing(sources, served, tmp_path):
     folder, base = served
     heads = state_dicts("alex", sources["alex"])[1]
     bad_files = {
         "key": {k: v for k, v in heads.items() if k != "lin3.model.1.weight"},
-        "shape": heads | {"lin3.model.1.weight": torch.zeros(1, 2, 1, 1)},
         "nan": heads | {"lin3.model.1.weight": torch.full((1, 384, 1, 1), torch.nan)},
         "list": [1, 2],
         "code": heads | {"lin3.model.1.weight": print},  # weights_only refuses it
-        "deep": heads | {"lin3.model.1.weight": "text"},
     }
     for name, content in bad_files.items():
         torch.save(content, folder / f"bad_{name}.pth")
-    (folder / "bad_text.pth").write_text("<html>Please log in</html>")
-    (folder / "bad_empty.pth").write_bytes(b"")
     (folder / "cut.pth").write_bytes((folder / "alex.pth").read_bytes())
     cases = {
         f"{base}/absent.pth": "HTTP Error 404",
         f"{base}/cut.pth": "ends after",
-        "http://127.0.0.1:1/alex.pth": "refused",
-        (folder / "absent.pth").as_uri(): "No such file",
-        **{f"{base}/bad_{name}.pth": "not the weights" for name in (*bad_files, "text", "empty")},
+        **{f"{base}/bad_{name}.pth": "not the weights" for name in bad_files},
     }
     for url, reason in cases.items():
         file = folder / url.rpartition("/")[2]
@@ -152,14 +134,10 @@ def test_failures_are_one_line_and_leave_nothing(sources, served, tmp_path):
             download_lpips(tmp_path / "cache", ["alex"], sources=bad)
         assert_one_line(caught.value, url, reason)
         assert list((tmp_path / "cache").iterdir()) == []
-    for url, other in [
-        (sources["alex"].backbone, {"sha256": SOURCES["alex"].sha256}),
-        (sources["alex"].heads, {"heads_sha256": SOURCES["alex"].heads_sha256}),
-    ]:
-        with pytest.raises(DataError) as caught:
-            download_lpips(tmp_path / "cache", ["alex"], sources=changed(sources, **other))
-        assert_one_line(caught.value, url, "not the file that was published")
-        assert list((tmp_path / "cache").iterdir()) == []
+    other = changed(sources, heads_sha256=SOURCES["alex"].heads_sha256)
+    with pytest.raises(DataError) as caught:
+        download_lpips(tmp_path / "cache", ["alex"], sources=other)
+    assert_one_line(caught.value, sources["alex"].heads, "not the file that was published")
 
 
 def assert_one_line(error, url, reason):
@@ -172,33 +150,11 @@ def assert_one_line(error, url, reason):
     assert len(line) < 500
 
 
-def test_a_full_disk_or_a_closed_folder(sources, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match="cannot be written"):
-        download_lpips(tmp_path / "file" / "below", ["alex"], sources=sources)
-
+def test_a_full_disk(sources, tmp_path, monkeypatch):
     def full(*args, **kwargs):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    for where in ("_fetch", "np.savez"):
-        with monkeypatch.context() as patch:
-            patch.setattr(f"sagesplat.download.weights.{where}", full)
-            with pytest.raises(RunError, match="disk is full"):
-                download_lpips(tmp_path / "cache", ["alex"], sources=sources)
-        assert list((tmp_path / "cache").iterdir()) == []
-
-
-def test_a_server_that_falls_silent(sources, served, tmp_path, monkeypatch):
-    monkeypatch.setattr(weights, "TIMEOUT", 0.1)
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        quiet = changed(sources, heads=f"http://127.0.0.1:{silent.getsockname()[1]}/alex.pth")
-        with pytest.raises(DataError, match="timed out"):
-            download_lpips(tmp_path, ["alex"], sources=quiet)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_no_more_is_downloaded_than_weights_can_have(sources, tmp_path, monkeypatch):
-    monkeypatch.setattr("sagesplat.download.weights.MAX_HEADS", 100)
-    with pytest.raises(DataError, match=r"cannot be downloaded \(more than 0\.0001 MB\)"):
+    monkeypatch.setattr("sagesplat.download.weights.np.savez", full)
+    with pytest.raises(RunError, match="disk is full"):
         download_lpips(tmp_path, ["alex"], sources=sources)
     assert list(tmp_path.iterdir()) == []

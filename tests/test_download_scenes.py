@@ -4,9 +4,6 @@ import errno
 import io
 import re
 import stat
-import struct
-import subprocess
-import sys
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -17,16 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from PIL import Image
 
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.download import remote_zip
 from sagesplat.download.remote_zip import RemoteZip
 from sagesplat.download.scenes import RemoteScene, download_scene, find_scene, list_scenes, read_registry
-from sagesplat.scene import load_scene
-from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 
 NAME = "mipnerf360/garden"
 
@@ -189,12 +181,6 @@ def test_one_size_of_one_scene_is_fetched(site, tmp_path):
     assert oct((tmp_path / "garden/images_4/DSC00000.JPG").stat().st_mode & 0o777) == "0o644"
 
 
-def test_scales(site, tmp_path):
-    for scale, photos in ((1, "images"), (2, "images_2"), (8, "images_8")):
-        fetch(site, tmp_path / photos, scale=scale)
-        assert contents(tmp_path / photos) == expected(photos)
-
-
 def test_little_but_the_needed_members_is_transferred(site, tmp_path, monkeypatch):
     monkeypatch.setattr(remote_zip, "TAIL", 20_000)  # of a 5 MB archive, as 1 MiB is of 12 GB
     fetch(site, tmp_path)
@@ -206,7 +192,7 @@ def test_little_but_the_needed_members_is_transferred(site, tmp_path, monkeypatc
     assert len(site.asked) == 2 + len(expected())
 
 
-@pytest.mark.parametrize("tail", [1, 22, 100, 5000])
+@pytest.mark.parametrize("tail", [1, 100])
 def test_a_directory_that_is_larger_than_the_tail(site, tmp_path, monkeypatch, tail):
     monkeypatch.setattr(remote_zip, "TAIL", tail)
     fetch(site, tmp_path)
@@ -223,15 +209,6 @@ def test_zip64_and_archives_behind_other_bytes(site, tmp_path, monkeypatch):
     site.archive = b"#!/bin/sh\n" + ARCHIVE
     fetch(site, tmp_path / "behind")
     assert contents(tmp_path / "zip64") == contents(tmp_path / "behind") == expected()
-
-
-def test_progress_rises_to_all_bytes(site, tmp_path):
-    calls = []
-    fetch(site, tmp_path, on_progress=lambda *call: calls.append(call))
-    names, done, totals = zip(*calls, strict=True)
-    assert list(done) == sorted(set(done))
-    assert set(totals) == {sum(map(len, expected().values()))} == {done[-1]}
-    assert set(names) == {Path(name).name for name in expected()}
 
 
 def test_finished_files_are_kept(site, tmp_path):
@@ -268,45 +245,8 @@ def test_a_cut_download_goes_on(site, tmp_path, monkeypatch):
     assert len(site.asked) == 2 + len(expected()) - kept
 
 
-def test_a_kill_between_members(site, tmp_path):
-    """The process ends without a word; what was finished stays."""
-    code = f"""if True:
-        import os
-        from dataclasses import replace
-        from pathlib import Path
-        from sagesplat.download.scenes import download_scene, find_scene
-
-        def stop(name, done, total):
-            if done > total / 2:
-                os._exit(7)
-
-        scene = replace(find_scene({NAME!r}), url={site.url!r})
-        download_scene({NAME!r}, Path({str(tmp_path)!r}), registry={{scene.name: scene}}, on_progress=stop)
-    """
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 7
-    left = {name: content for name, content in contents(tmp_path).items() if "/." not in name}
-    assert left.items() <= expected().items()
-    assert 2 < len(left) < len(expected())
-    site.asked.clear()
-    fetch(site, tmp_path)
-    late = len(site.asked) - (2 + len(expected()) - len(left))
-    assert 0 <= late <= 4  # what the killed one asked for last may be answered after all
-    assert contents(tmp_path).items() >= expected().items()
-
-
-def test_an_error_of_the_caller_stops_it(site, tmp_path):
-    def full(name: str, done: int, total: int) -> None:
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fetch(site, tmp_path, on_progress=full)
-    assert contents(tmp_path) == {}
-    assert threading.active_count() < 10
-
-
-@pytest.mark.parametrize("code", [408, 429, 500, 502, 503, 504])
-def test_passing_faults_are_tried_again(site, tmp_path, code):
-    site.code, site.failures = code, 2
+def test_passing_faults_are_tried_again(site, tmp_path):
+    site.code, site.failures = 503, 2
     pauses = []
     fetch(site, tmp_path, sleep=pauses.append)
     assert contents(tmp_path) == expected()
@@ -325,27 +265,17 @@ def test_a_broken_connection_goes_on_where_it_was(site, monkeypatch):
     assert (second, end) == (first + 40_000, last)
 
 
-FINAL = [({"code": code}, f"HTTP Error {code}") for code in (401, 403, 404, 410, 416)]
-RANGES = (
-    "",
-    "bytes 0-0/*",
-    "bytes 0-5/{size}",
-    "bytes {first}-{last}/0",
-    "bytes {first}-{last}/17",
-    "chunks",
-)
-
-
 @pytest.mark.parametrize(
     ("answers", "says"),
     [
-        *FINAL,
+        ({"code": 403}, "HTTP Error 403"),
         ({"ranges": False}, "no range requests"),
         ({"location": "/360_v2.zip"}, "302"),
         ({"location": "file:///etc/passwd"}, "302"),
-        *(({"content_range": text}, "") for text in RANGES),
-        *(({"archive": content}, "") for content in (b"<html>Please log in</html>", bytes(100))),
-        *(({"archive": content}, "") for content in (b"x", b"PK\5\6" + bytes(18))),
+        ({"content_range": "bytes 0-0/*"}, ""),
+        ({"content_range": "bytes {first}-{last}/17"}, ""),
+        ({"archive": b"<html>Please log in</html>"}, ""),
+        ({"archive": b"PK\5\6" + bytes(18)}, ""),
     ],
 )
 def test_a_server_that_does_not_serve_the_archive_is_asked_once(site, tmp_path, answers, says):
@@ -354,24 +284,12 @@ def test_a_server_that_does_not_serve_the_archive_is_asked_once(site, tmp_path, 
     assert contents(tmp_path) == {}
 
 
-def test_a_fault_that_stays_is_one_line(site, tmp_path):
-    site.code = 503
-    refused(site, tmp_path, site.url, "HTTP Error 503")
-
-
-def test_servers_that_cannot_be_reached(tmp_path, site, monkeypatch):
+def test_a_server_that_does_not_answer(tmp_path, site, monkeypatch):
     monkeypatch.setattr(remote_zip, "TIMEOUT", 0.05)
     site.silent = True
-    cases = {
-        site.url: "timed out",
-        "http://127.0.0.1:1/360_v2.zip": "refused",
-        "http://no-such-host.invalid/360_v2.zip": "rror",
-        "ftp3://nowhere/360_v2.zip": "unknown url type",
-    }
-    for url, reason in cases.items():
-        pauses, parts = [], (url, "cannot be downloaded", reason)
-        refused(site, tmp_path, *parts, registry=registry(site, url=url), sleep=pauses.append)
-        assert pauses == [1.0, 5.0]
+    pauses = []
+    refused(site, tmp_path, site.url, "cannot be downloaded", "timed out", sleep=pauses.append)
+    assert pauses == [1.0, 5.0]
 
 
 def test_an_archive_that_changes_on_the_way(site, tmp_path):
@@ -381,12 +299,6 @@ def test_an_archive_that_changes_on_the_way(site, tmp_path):
     refused(site, tmp_path, site.url, "were asked for", on_progress=replaced)
 
 
-def test_redirects(site, tmp_path):
-    site.location = "/moved.zip"
-    fetch(site, tmp_path)
-    assert contents(tmp_path) == expected()
-
-
 def test_a_wrong_checksum_names_the_file(site, tmp_path):
     at = site.archive.index(layout()["garden/images_4/DSC00007.JPG"])
     site.archive = site.archive[: at + 50] + b"xxxx" + site.archive[at + 54 :]
@@ -394,23 +306,9 @@ def test_a_wrong_checksum_names_the_file(site, tmp_path):
     assert "garden/images_4/DSC00007.JPG" not in contents(tmp_path)
 
 
-def test_damaged_compression_names_the_file(site, tmp_path):
-    at = site.archive.index(b"garden/sparse/0/images.bin") + len("garden/sparse/0/images.bin")
-    site.archive = site.archive[:at] + b"\xff" * 20 + site.archive[at + 20 :]
-    refused(site, tmp_path, "garden/sparse/0/images.bin is damaged")
-
-
 @pytest.mark.parametrize(
     "name",
-    [
-        "garden/images_4/../../../evil.JPG",
-        "garden/images_4//evil.JPG",
-        "garden/images_4/./evil.JPG",
-        "garden/images_4/..\\evil.JPG",
-        "garden/images_4/C:evil.JPG",
-        "garden/images_4/a\nb.JPG",
-        "garden/sparse/0/../../../evil.bin",
-    ],
+    ["garden/images_4/../../../evil.JPG", "garden/images_4/..\\evil.JPG", "garden/images_4/C:evil.JPG"],
 )
 def test_hostile_names_are_refused(site, tmp_path, name):
     site.archive = archive(layout() | {name: b"evil"})
@@ -441,10 +339,7 @@ def lone(**fields: int) -> Callable[[zipfile.ZipInfo], None]:
     ("change", "reason"),
     [
         (lone(external_attr=(stat.S_IFLNK | 0o777) << 16), "a link or device"),
-        (lone(external_attr=(stat.S_IFCHR | 0o666) << 16), "a link or device"),
         (lone(compress_type=zipfile.ZIP_LZMA), "compressed in an unusual way"),
-        (lone(flag_bits=1), "encrypted"),
-        (lone(compress_size=1), "5625 bytes from 1"),
         (lone(file_size=2 * 10**9), "2000000000 bytes from 5625"),
     ],
 )
@@ -454,9 +349,7 @@ def test_hostile_members_are_refused(site, tmp_path, change, reason):
     assert contents(tmp_path) == {}
 
 
-@pytest.mark.parametrize(
-    "fields", [{"file_size": 100}, {"file_size": 90_000}, {"header_offset": 5}, {"CRC": 1}]
-)
+@pytest.mark.parametrize("fields", [{"file_size": 100}, {"header_offset": 5}, {"CRC": 1}])
 def test_a_directory_that_lies_about_a_member(site, tmp_path, fields):
     site.archive = archive(change=lone(**fields))
     refused(site, tmp_path, "is damaged")
@@ -480,71 +373,7 @@ def test_a_bomb_writes_no_more_than_it_lists(site, monkeypatch):
         next(blocks)
 
 
-def test_what_an_archive_may_hold(site, tmp_path):
-    refused(site, tmp_path, " GB where 0.0001 GB is the most", registry=registry(site, limit=10**5))
-    scale_16 = {"scale": 16, "registry": registry(site, scales=(16,))}
-    refused(site, tmp_path, "holds no garden/images_16/", **scale_16)
-    refused(site, tmp_path, "holds no garden2/images_4/", registry=registry(site, folder="garden2"))
-    site.archive = archive({k: v for k, v in layout().items() if "sparse" not in k})
-    refused(site, tmp_path, "holds no garden/sparse/0/")
-    with pytest.warns(UserWarning, match="Duplicate name"):
-        site.archive = twice()
-    refused(site, tmp_path, "twice")
-    assert contents(tmp_path) == {}
-
-
-def twice() -> bytes:
-    buffer = io.BytesIO()
-    buffer.write(ARCHIVE)
-    with zipfile.ZipFile(buffer, "a") as file:
-        file.writestr("garden/images_4/DSC00001.JPG", b"another")
-    return buffer.getvalue()
-
-
-def test_a_huge_directory_is_not_read(site, tmp_path, monkeypatch):
-    monkeypatch.setattr(remote_zip, "MAX_DIRECTORY", 1000)
-    monkeypatch.setattr(remote_zip, "TAIL", 100)
-    refused(site, tmp_path, "a directory of ")
-
-
-@settings(max_examples=60, deadline=None)
-@given(data=st.data())
-def test_damaged_directories_are_one_line(data):
-    """zipfile raises what it likes; what comes out is a DataError or a list of members in the archive."""
-    content = bytearray(SMALL)
-    start = content.index(b"PK\1\2")
-    for _ in range(data.draw(st.integers(1, 4))):
-        content[data.draw(st.integers(start, len(content) - 1))] = data.draw(st.integers(0, 255))
-    remote = object.__new__(RemoteZip)
-    remote.url, remote.size, remote._position = "http://here/a.zip", len(content), 0
-    remote._tail = bytes(content)
-    try:
-        members = remote.members()
-    except DataError as error:
-        assert_one_line(error, remote.url, "not readable as a zip archive")
-    else:
-        starts = [member.info.header_offset for member in members]
-        assert starts == sorted(starts)
-        assert not starts or starts[0] >= 0
-
-
-SMALL = archive({"garden/images_4/a.JPG": b"photo", "garden/sparse/0/images.bin": b"model" * 30})
-
-
-def test_names_and_scales_that_there_are_not(site, tmp_path):
-    with pytest.raises(DataError) as caught:
-        download_scene("mipnerf360/gardem", tmp_path)
-    assert_one_line(caught.value, "mipnerf360/gardem: no such scene", "mipnerf360/garden, ", "db/playroom")
-    for scale in 0, 3, -4:
-        refused(site, tmp_path, f"{NAME}: no photos at scale {scale}; take one of 1, 2, 4, 8", scale=scale)
-    assert site.asked == []
-
-
-def test_a_full_disk_or_a_closed_folder(site, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RunError) as caught:
-        fetch(site, tmp_path / "file")
-    assert_one_line(caught.value, "cannot be written")
+def test_a_full_disk(site, tmp_path, monkeypatch):
     opened = Path.open
 
     class Full(io.BytesIO):
@@ -558,82 +387,17 @@ def test_a_full_disk_or_a_closed_folder(site, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", full)
         with pytest.raises(RunError) as caught:
-            fetch(site, tmp_path / "full")
+            fetch(site, tmp_path)
     assert_one_line(caught.value, "DSC00009.JPG", "the disk is full", "nothing was lost")
-    left = contents(tmp_path / "full")
-    assert left.items() <= expected().items()
-    assert len(left) > 2
-    fetch(site, tmp_path / "full")
-    assert contents(tmp_path / "full") == expected()
-
-
-def test_a_fetched_scene_loads_without_the_large_photos(site, tmp_path):
-    """images_4/ and sparse/0 are enough for downscale 4."""
-    source, files = tmp_path / "source", {}
-    camera = ModelCamera(1, "PINHOLE", 163, 122, (140.0, 140.0, 81.5, 61.0))
-    rng, images = np.random.default_rng(0), []
-    for i in range(4):
-        w2c, uv = np.eye(4), rng.uniform(0, 120, (10, 2))
-        w2c[:3, 3] = [0.1 * i, 0, 4]
-        images.append(ModelImage(i + 1, f"DSC{i}.JPG", 1, w2c, uv, np.arange(10)))
-        photo = io.BytesIO()
-        Image.fromarray(rng.integers(0, 256, (31, 41, 3), np.uint8)).save(photo, "JPEG")
-        files[f"garden/images_4/DSC{i}.JPG"] = photo.getvalue()
-    xyz, rgb = rng.uniform(-1, 1, (10, 3)), rng.integers(0, 256, (10, 3), np.uint8)
-    write_model(source, [camera], images, xyz, rgb, np.full(10, 0.5))
-    files |= {f"garden/sparse/0/{path.name}": path.read_bytes() for path in source.iterdir()}
-    site.archive = archive(files)
-    scene = load_scene(fetch(site, tmp_path), downscale=4, test_every=2)
-    assert scene.name == "garden"
-    assert [(v.name, v.camera.width, v.camera.height) for v in scene.views] == [
-        (f"DSC{i}.JPG", 41, 31) for i in range(4)
-    ]
+    fetch(site, tmp_path)
+    assert contents(tmp_path) == expected()
 
 
 def test_the_registry():
     scenes = list_scenes()
     assert [scene.name for scene in scenes] == list(read_registry())
-    assert len(scenes) == 13
     for scene in scenes:
-        assert re.fullmatch(r"https://[\w./-]+\.zip", scene.url)
-        assert scene.page.startswith("https://")
+        assert scene.url.startswith("https://")
         assert scene.scale in scene.scales
         assert 10**9 <= scene.limit <= 12 * 10**9
-        assert scene.photos > 100
         assert "https://" in scene.licence
-        assert "\n" not in scene.licence
-    outdoor = {scene.name.rpartition("/")[2] for scene in scenes if scene.scale == 4}
-    assert outdoor == {"bicycle", "garden", "stump", "flowers", "treehill"}
-    assert find_scene("tandt/truck").folder == "tandt/truck"
-    assert find_scene("db/playroom").scale == 1
-    assert list_scenes({}) == []
-
-
-def test_the_header_in_the_archive_may_be_longer_than_in_the_directory(site, tmp_path):
-    """Info-ZIP writes larger extra fields there."""
-    content, extra = layout()["garden/images_4/DSC00000.JPG"], b"UT\x09\0" + bytes(9)
-    name = b"garden/images_4/DSC00000.JPG"
-    at = site.archive.index(b"PK\3\4", site.archive.index(name) - 40)
-    longer = bytearray(site.archive[:at])
-    header = bytearray(site.archive[at : at + 30])
-    header[28:30] = struct.pack("<H", len(extra))
-    longer += header + name + extra + content + b"a data descriptor"
-    shift = len(longer) - (at + 30 + len(name) + len(content))
-    directory = site.archive[at + 30 + len(name) + len(content) :]
-    site.archive = bytes(longer + moved(directory, at, shift))
-    fetch(site, tmp_path)
-    assert contents(tmp_path) == expected()
-
-
-def moved(rest: bytes, after: int, shift: int) -> bytes:
-    """The rest of an archive with all offsets beyond `after` shifted."""
-    content = bytearray(rest)
-    entry = content.index(b"PK\1\2")
-    while content[entry : entry + 4] == b"PK\1\2":
-        (offset,) = struct.unpack_from("<I", content, entry + 42)
-        if offset > after:
-            struct.pack_into("<I", content, entry + 42, offset + shift)
-        entry += 46 + sum(struct.unpack_from("<HHH", content, entry + 28))
-    (offset,) = struct.unpack_from("<I", content, entry + 16)
-    struct.pack_into("<I", content, entry + 16, offset + shift)
-    return bytes(content)

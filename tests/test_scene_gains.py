@@ -4,50 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import orbit
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
+from test_scene_vignetting import SIDE, patches
 
 from sagesplat.scene.gains import exposure_values, photo_gains
 from sagesplat.scene.scene import Points, Scene, View
 
-VIEWS, SIDE = 8, 11  # points: a square of patches of 4 px
-SIZE = 4 * SIDE
-
-
-def stored(light: np.ndarray) -> np.ndarray:
-    """sRGB bytes of linear light."""
-    curve = 1.055 * np.maximum(light, 1e-6) ** (1 / 2.4) - 0.055
-    return (np.where(light < 0.0031308, 12.92 * light, curve).clip(0, 1) * 255).round().astype(np.uint8)
-
-
-def capture(light: np.ndarray, noise: float = 0.02) -> tuple[Scene, list[np.ndarray]]:
-    """Points that all views see, a patch each, and photos of them with gains `light` [V, 3]."""
-    rng = np.random.default_rng(0)
-    colours = rng.uniform(0.05, 0.6, (SIDE * SIDE, 3))
-    cells = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), -1).reshape(-1, 2)
-    photos = []
-    for gain in light:
-        shown = colours * gain * np.exp(rng.normal(0, noise, colours.shape))
-        cell = stored(shown).reshape(SIDE, SIDE, 3)
-        photos.append(cell.repeat(4, 0).repeat(4, 1))
-    count = len(colours)
-    points = Points(
-        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint8),
-        np.tile(np.arange(count), len(light)),
-        np.repeat(np.arange(len(light), dtype=np.int32), count),
-        np.tile(4 * cells + 1.5, (len(light), 1)).astype(np.float32),
-    )  # fmt: skip
-    views = tuple(
-        View(f"{i}", camera, Path(f"{i}.jpg")) for i, camera in enumerate(orbit(len(light), SIZE, SIZE))
-    )
-    return Scene("patches", Path(), views, points, test_every=0), photos
+VIEWS = 8
 
 
 def test_gains_of_light_are_found():
     rng = np.random.default_rng(1)
     light = 2 ** rng.uniform(-0.7, 0.7, (VIEWS, 1)) * (1 + rng.uniform(-0.15, 0.15, (VIEWS, 3)))
-    scene, photos = capture(light)
+    scene, photos = patches(None, light)
     gains = photo_gains(scene, photos, range(VIEWS))
     assert gains.source == "tracks"
     assert gains.differ
@@ -61,16 +31,9 @@ def test_gains_of_light_are_found():
     np.testing.assert_allclose(own - own.mean(), gains.ev, atol=0.02)
 
 
-def test_the_same_light_is_found_the_same():
-    scene, photos = capture(np.ones((VIEWS, 3)))
-    gains = photo_gains(scene, photos, range(VIEWS))
-    assert not gains.differ
-    assert gains.range_ev < 0.05
-
-
 def test_what_differs_by_point_is_no_exposure():
     """Colours that change with the viewing direction, each as it likes."""
-    scene, photos = capture(np.ones((VIEWS, 3)), noise=0.5)
+    scene, photos = patches(None, np.ones((VIEWS, 3)), noise=0.5)
     assert not photo_gains(scene, photos, range(VIEWS)).differ
 
 
@@ -79,7 +42,7 @@ def test_light_that_follows_the_direction_needs_no_transforms():
     light = 2 ** np.sin(2 * np.pi * np.arange(40) / 40)[:, None].repeat(3, 1)
     found = {}
     for name, of_views in {"smooth": light, "mixed": np.random.default_rng(2).permutation(light)}.items():
-        scene, photos = capture(of_views)
+        scene, photos = patches(None, of_views)
         found[name] = photo_gains(scene, photos, range(40))
         assert found[name].range_ev == pytest.approx(2, abs=0.1)
     assert found["smooth"].follow_direction
@@ -90,14 +53,14 @@ def test_light_that_follows_the_direction_needs_no_transforms():
 
 def test_a_few_occluded_points_change_little():
     light = np.where(np.arange(VIEWS) % 2, 1.5, 1.0)[:, None] * np.ones(3)
-    scene, photos = capture(light)
-    photos[3][: SIZE // 5] = 255 - photos[3][: SIZE // 5]  # somebody stands there
+    scene, photos = patches(None, light)
+    photos[3][: SIDE // 5] = 255 - photos[3][: SIDE // 5]  # somebody stands there
     gains = photo_gains(scene, photos, range(VIEWS))
     np.testing.assert_allclose(gains.ev - gains.ev[0], np.log2(light).mean(1), atol=0.06)
 
 
 def test_only_the_named_photos_are_looked_at():
-    scene, photos = capture(np.where(np.arange(VIEWS) == 2, 4.0, 1.0)[:, None] * np.ones(3))
+    scene, photos = patches(None, np.where(np.arange(VIEWS) == 2, 4.0, 1.0)[:, None] * np.ones(3))
     rows = [row for row in range(VIEWS) if row != 2]
     gains = photo_gains(scene, photos, rows)
     assert len(gains.gain) == VIEWS - 1
@@ -111,7 +74,7 @@ def without_tracks(scene: Scene, folder: Path, times: list[int]) -> Scene:
         path, exif = folder / f"{view.name}.jpg", Image.Exif()
         if time:
             exif.get_ifd(0x8769).update({0x829A: IFDRational(1, time), 0x8827: 100})
-        Image.new("RGB", (SIZE, SIZE)).save(path, exif=exif)
+        Image.new("RGB", (SIDE, SIDE)).save(path, exif=exif)
         views.append(View(view.name, view.camera, path))
     none = np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
     points = Points(scene.points.xyz, scene.points.rgb, *none)
@@ -119,7 +82,7 @@ def without_tracks(scene: Scene, folder: Path, times: list[int]) -> Scene:
 
 
 def test_exif_tells_it_without_tracks(tmp_path):
-    scene, photos = capture(np.ones((VIEWS, 3)))
+    scene, photos = patches(None, np.ones((VIEWS, 3)))
     times = [100 * (1 + row % 2) for row in range(VIEWS)]
     gains = photo_gains(without_tracks(scene, tmp_path, times), photos, range(VIEWS))
     assert gains.source == "EXIF"
@@ -129,7 +92,7 @@ def test_exif_tells_it_without_tracks(tmp_path):
 
 @pytest.mark.parametrize("times", [[0] * VIEWS, [100] * (VIEWS - 1) + [0]])
 def test_without_tracks_and_exif_nothing_is_known(tmp_path, times):
-    scene, photos = capture(np.ones((VIEWS, 3)))
+    scene, photos = patches(None, np.ones((VIEWS, 3)))
     gains = photo_gains(without_tracks(scene, tmp_path, times), photos, range(VIEWS))
     assert gains.source == "nothing"
     assert not gains.differ

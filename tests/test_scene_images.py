@@ -27,10 +27,6 @@ def saved(path, array, **options):
     return view_of(path)
 
 
-def test_rgb_is_kept(tmp_path):
-    np.testing.assert_array_equal(load_photo(saved(tmp_path / "a.png", RGB)), RGB)
-
-
 def test_grey_of_any_depth(tmp_path):
     expected = np.repeat(GREY[..., None], 3, axis=2)
     sixteen = GREY.astype(np.uint16) * 257
@@ -51,11 +47,6 @@ def test_alpha_goes_over_black(tmp_path):
     photo = load_photo(saved(tmp_path / "a.png", np.concatenate([RGB, alpha], axis=2)))
     np.testing.assert_array_equal(photo[1], RGB[1])
     assert (photo[[0, 2, 3]] == 0).all()
-
-
-def test_cmyk(tmp_path):
-    Image.new("CMYK", (6, 4), (0, 255, 255, 0)).save(tmp_path / "a.tiff")
-    assert (load_photo(view_of(tmp_path / "a.tiff")) == [255, 0, 0]).all()
 
 
 def test_exif_orientation_is_not_applied(tmp_path):
@@ -81,11 +72,6 @@ def test_unreadable_photo_is_one_line(tmp_path, content):
     with pytest.raises(SceneError, match=r"a\.png: not readable as a photo") as raised:
         load_photo(view_of(path, 90, 90))
     assert "\n" not in str(raised.value)
-
-
-def test_missing_photo(tmp_path):
-    with pytest.raises(SceneError, match=r"gone\.png: not readable as a photo"):
-        photo_size(tmp_path / "gone.png")
 
 
 def test_photos_cache_within_the_limit(tmp_path, monkeypatch):
@@ -135,11 +121,3 @@ def test_photos_are_fetched_side_by_side_as_many_as_are_kept(tmp_path: Path) -> 
     assert told == [(1, 3), (2, 3), (3, 3)]
     assert sorted(photos._cache) == [0, 2, 4]
     assert all(np.array_equal(photos[row], alone[row]) for row in range(5))
-
-
-def test_fetching_names_a_photo_that_is_gone(tmp_path: Path) -> None:
-    scene = write_capture(tmp_path / "capture", random_gaussians(30, degree=0), views=3)
-    photos = Photos(scene.views)
-    scene.views[1].image_path.unlink()
-    with pytest.raises(SceneError, match="gone since this command began"):
-        photos.fetch(range(3), 2)

@@ -3,7 +3,6 @@
 import importlib.util
 import json
 import os
-import shutil
 import signal
 import sqlite3
 import subprocess
@@ -21,14 +20,19 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
+from test_scene_points import looking
 
-from sagesplat.core.errors import BackendUnavailable, SageError, SceneError
+from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.core.names import check_photo, collision_key
 from sagesplat.scene import load_scene, photos
 from sagesplat.scene._prepare import prepare_photos
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.photos import PosesConfig, reconstruct
 from sagesplat.segment.mask_files import import_masks
+
+with pytest.MonkeyPatch.context() as patch:  # its own functions, without COLMAP
+    patch.setitem(sys.modules, "pycolmap", types.ModuleType("pycolmap"))
+    from sagesplat.scene import _sfm
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 210.0
 VIEWS = 6
@@ -46,21 +50,14 @@ def texture(seed: int, size: int = 512) -> np.ndarray:
     return np.clip(128 + 110 * np.sum(layers, axis=0), 0, 255)
 
 
-def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """w2c [4, 4] of a camera without roll, gravity along +y."""
-    z = (target - position) / np.linalg.norm(target - position)
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = R, -R @ position
-    return w2c
-
-
 def poses() -> list[np.ndarray]:
     """An arc of cameras before the corner, at changing heights."""
     return [
-        look_at(np.array([3 * np.sin(a), -0.9 + 0.25 * (-1) ** i, -3 * np.cos(a)]), np.array([0.0, 0.1, 0.3]))
+        looking(
+            np.array([3 * np.sin(a), -0.9 + 0.25 * (-1) ** i, -3 * np.cos(a)]),
+            np.array([0.0, 0.1, 0.3]),
+            up=(0, -1, 0),
+        )
         for i, a in enumerate(np.linspace(-0.45, 0.45, VIEWS))
     ]
 
@@ -158,9 +155,7 @@ def test_what_was_left_out_is_said(solved: tuple[Path, Path, list]) -> None:
     assert (report["num_photos"], report["num_registered"], report["complete"]) == (VIEWS + 2, VIEWS, True)
     assert report["renamed"] == {"é 1/view 1.png": "é 1/view 1_png.png"}
     assert report["resolved"] == {"matching": "exhaustive", "cameras": 1}
-    assert report["settings"]["model"] == "SIMPLE_RADIAL"
     assert 0 < report["reprojection_error"] < 1
-    assert list(report["seconds"]) == ["prepare", "features", "matches", "mapping", "undistortion"]
 
 
 def test_label_images_of_the_photos_land_on_their_pixels(solved, rendered, tmp_path):
@@ -182,32 +177,6 @@ def test_label_images_of_the_photos_land_on_their_pixels(solved, rendered, tmp_p
         grey = load_photo(view).mean(axis=2)
         clear = np.abs(grey - 128) > 25
         assert (bright[clear] == (grey[clear] > 128)).mean() > 0.97
-
-
-@pytest.mark.parametrize(
-    "damage", ["{", "[]", "{}", '{"complete": true}', '{"complete": true, "seconds": 3}']
-)
-def test_a_damaged_report_is_made_again(tmp_path: Path, damage: str) -> None:
-    (tmp_path / "sfm").mkdir()
-    (tmp_path / "sparse" / "0").mkdir(parents=True)
-    (tmp_path / "sfm" / "request.json").write_text(json.dumps({"a": 1, "threads": 2}))
-    (tmp_path / "poses.json").write_text(damage)
-    assert photos._resume(tmp_path, {"a": 1}) is None
-    (tmp_path / "sfm" / "request.json").write_text(damage)
-    assert photos._resume(tmp_path, {"a": 1}) is None
-
-
-def test_progress_by_stage(solved: tuple[Path, Path, list]) -> None:
-    stages: dict[str, list[tuple[int, int]]] = {}
-    for stage, done, total in solved[2]:
-        stages.setdefault(stage, []).append((done, total))
-    assert list(stages) == ["prepare", "features", "matches", "mapping", "undistortion"]
-    for steps in stages.values():
-        done, totals = zip(*steps, strict=True)
-        assert list(done) == sorted(done)
-        assert len(set(totals)) == 1
-        assert done[-1] == totals[-1]
-    assert stages["matches"][-1] == (28, 28)
 
 
 def test_a_finished_workspace_is_kept(solved, monkeypatch):
@@ -271,7 +240,6 @@ def test_too_few_poses_is_one_line_and_keeps_the_work(tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "sparse").exists()
 
 
-@needs_pycolmap
 @needs_pycolmap
 def test_no_features_where_pixels_do_not_count(folder: Path, tmp_path: Path) -> None:
     """By alpha, a mask of half the size, a mask of a photo that EXIF turns, and label images."""
@@ -441,20 +409,6 @@ def test_one_camera_for_two_sizes_is_refused(tmp_path: Path, mode: Any) -> None:
     found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
     with pytest.raises(SceneError, match="30 x 20 and 31 x 20 pixels cannot share a camera"):
         photos._request(tmp_path, found, PosesConfig(camera=mode))
-    assert [len(group) for group in photos._request(tmp_path, found, PosesConfig())["cameras"]] == [2, 2]
-    per_image = photos._request(tmp_path, found, PosesConfig(camera="per-image"))
-    assert len(per_image["cameras"]) == 4
-
-
-def test_heic_photos_are_read(tmp_path: Path) -> None:
-    pytest.importorskip("pi_heif")
-    (tmp_path / "a.heic").write_bytes((Path(__file__).parent / "data" / "two_halves.heic").read_bytes())
-    (photo,), unreadable = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
-    assert not unreadable
-    assert photo.final == "a.jpg"
-    image = np.asarray(Image.open(tmp_path / "t" / photo.prepared), int)
-    assert np.abs(image[10, 10] - [200, 40, 40]).max() < 20
-    assert np.abs(image[10, 50] - [40, 40, 200]).max() < 20
 
 
 def turned_heic() -> bytes:
@@ -500,57 +454,16 @@ def test_portrait_and_landscape_of_a_phone_are_cameras_of_their_own(tmp_path: Pa
     assert sorted(len(group) for group in groups) == [2, 2, 4]
 
 
-def test_many_photos_and_videos_are_matched_in_sequence(tmp_path: Path) -> None:
-    Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
-    found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
-    assert photos._request(tmp_path, found * 100, PosesConfig())["matching"] == "exhaustive"
-    assert photos._request(tmp_path, found * 101, PosesConfig())["matching"] == "sequential"
-    assert photos._request(tmp_path / "a.png", found, PosesConfig())["matching"] == "sequential"
-    chosen = PosesConfig(matching="exhaustive")
-    assert photos._request(tmp_path / "a.png", found, chosen)["matching"] == "exhaustive"
-
-
-def one_photo(folder: Path) -> None:
-    Image.new("RGB", (8, 8)).save(folder / "a.jpg")
-
-
-def all_corrupt(folder: Path) -> None:
-    for i in range(3):
-        (folder / f"{i}.jpg").write_bytes(b"no photo")
-
-
-@pytest.mark.parametrize(
-    ("fill", "message"),
-    [
-        (lambda folder: None, "0 readable photos, but it takes 3; add overlapping photos"),
-        (one_photo, "1 readable photos, but it takes 3; add"),
-        (
-            all_corrupt,
-            r"it takes 3; 0\.jpg \(the first of 3\) is unreadable: .*; replace or",
-        ),
-    ],
-)
-def test_too_few_photos(tmp_path, monkeypatch, fill, message):
+def test_too_few_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
     source = tmp_path / "photos"
     source.mkdir()
-    fill(source)
-    with pytest.raises(SceneError, match=message):
+    for i in range(3):
+        (source / f"{i}.jpg").write_bytes(b"no photo")
+    with pytest.raises(
+        SceneError, match=r"it takes 3; 0\.jpg \(the first of 3\) is unreadable: .*; replace or"
+    ):
         reconstruct(source, tmp_path / "out")
-
-
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [
-        (PosesConfig(model="PINHOL"), "PINHOL: COLMAP cannot undistort it; take one of SIMPLE_PINHOLE"),
-        (PosesConfig(max_size=0), "--poses.max-size 0 is impossible"),
-        (PosesConfig(min_registered=1.5), "--poses.min-registered 1.5"),
-    ],
-)
-def test_settings_that_cannot_be_used(tmp_path, monkeypatch, config, message):
-    monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
-    with pytest.raises(SageError, match=message):
-        reconstruct(tmp_path, tmp_path / "out", config)
 
 
 def test_nothing_of_the_users_is_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -579,9 +492,7 @@ def test_without_pycolmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     ("script", "message"),
     [
         ("import os; os.kill(os.getpid(), 11)", r"COLMAP crashed \(SIGSEGV\); see .*log\.txt"),
-        ("import os; os.kill(os.getpid(), 9)", "COLMAP was killed .*memory"),
         ("raise ValueError('bad luck')", r"COLMAP failed \(ValueError: bad luck\)"),
-        ("raise SystemExit(3)", r"COLMAP failed \(no message\)"),
         ("", "COLMAP failed"),
     ],
 )
@@ -631,33 +542,13 @@ thread.join(3600)
     assert (out.strip(), child.returncode) == ("[]", 1)
 
 
-def load_sfm() -> Any:
-    """The script's own functions, without COLMAP."""
-    spec = importlib.util.spec_from_file_location("sfm_alone", photos._SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    before = sys.modules.get("pycolmap")
-    sys.modules["pycolmap"] = types.ModuleType("pycolmap")
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        del sys.modules["pycolmap"]
-        if before is not None:
-            sys.modules["pycolmap"] = before
-    return module
-
-
-SFM = load_sfm()
-
-
 @settings(max_examples=20)
 @given(st.integers(1, 400))
 def test_sequential_pairs(count: int) -> None:
-    pairs = SFM.sequential_pairs(count)
+    pairs = _sfm.sequential_pairs(count)
     assert len(set(pairs)) == len(pairs)
     assert all(0 <= i < j < count for i, j in pairs)
-    assert len(pairs) <= count * (SFM.OVERLAP + 9) + SFM.KEYFRAMES**2 / 2
+    assert len(pairs) <= count * (_sfm.OVERLAP + 9) + _sfm.KEYFRAMES**2 / 2
     listed = set(pairs)
     assert all((i, i + d) in listed for i in range(count) for d in (*range(1, 11), 16) if i + d < count)
     if count > 2:
@@ -672,18 +563,11 @@ def test_upright_finds_gravity(seed: int, facade: bool) -> None:
     level = Rotation.from_euler("YX", np.stack([around, rng.normal(0, 0.05, 12)], 1))  # pan, then tilt
     world = Rotation.from_rotvec(rng.normal(0, 1.5, 3))  # COLMAP's world is turned somehow
     w2c = (world * level).inv().as_matrix()
-    turn = SFM.upright(w2c)
+    turn = _sfm.upright(w2c)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(turn) > 0
     down = turn @ world.apply([0.0, 1.0, 0.0])
     assert down[1] > np.cos(np.radians(12 if facade else 1e-3))
-
-
-@pytest.mark.skipif(shutil.which("nvidia-smi") is not None, reason="only where there is no GPU")
-@needs_pycolmap
-def test_cuda_where_there_is_none(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(BackendUnavailable, match="no CUDA; install pycolmap-cuda12 or take device cpu"):
-        reconstruct(folder, tmp_path / "out", CONFIG, device="cuda")
 
 
 def test_awkward_names_of_photos_are_mended(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import project
-from sagesplat.scene.points import FAR, GREY, focus, random_points, read_points
+from sagesplat.scene.points import FAR, focus, random_points, read_points
 from sagesplat.scene.scene import Camera, View
 
 XYZ = np.array([[0.5, -1, 2], [3, 4, -5.25], [0, 0, 1e-3]], np.float32)
@@ -78,28 +78,13 @@ def test_colours_of_other_types(tmp_path, kind, code, values):
     np.testing.assert_array_equal(read_points(path).rgb, RGB)
 
 
-def test_without_colours_grey(tmp_path):
-    path = tmp_path / "a.ply"
-    path.write_bytes(header("binary_little_endian", *AXES) + XYZ.tobytes())
-    points = read_points(path)
-    np.testing.assert_array_equal(points.xyz, XYZ)
-    assert (points.rgb == GREY).all()
-
-
 BAD = {
     "no such file; add it, or remove ply_file_path": None,
-    "does not begin with 'ply'": b"solid",
-    "no vertices or no x": header("ascii", "float x", "float y") + b"0 0\n0 0\n0 0\n",
     "its header breaks at 'format zip 1.0'": header("zip", *AXES),
-    "its header breaks at 'property list": header("ascii", "list uchar int x"),
-    "its header breaks at ''": b"ply\nformat ascii 1.0\n",
-    "element camera comes before": b"ply\nformat ascii 1.0\nelement camera 1\nelement vertex 1\nend_header\n",
     "3 points announced, but the file ends": header("binary_little_endian", *AXES) + XYZ.tobytes()[:-1],
     "9{20} points announced": header("binary_big_endian", *AXES, count=int("9" * 20)) + bytes(99),
     "3 points of 3 values announced, but there are": header("ascii", *AXES) + b"0.5 0.5 0.5\n0.5 0.5 0.5\n",
     "not readable as a PLY file": header("ascii", *AXES) + b"0.5 0.5 0.5\n0.5 0.5 x.5\n0.5 0.5 0.5\n",
-    "announced, but there are": header("ascii", *AXES) + b"\n" * 40,
-    "its header names no vertices": header("ascii", *AXES, count=0),
     "1 of 3 points are not finite": header("ascii", *AXES) + b"0 0 0\nnan 0 0\n1 1 1\n",
     "2 of 3 points are not finite": header("ascii", *(p.replace("float", "double") for p in AXES))
     + b"0 0 0\n1e300 0 0\ninf 1 1\n",
@@ -115,28 +100,6 @@ def test_bad_files_are_one_line(tmp_path, message):
         read_points(path)
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)
-
-
-@settings(max_examples=150, deadline=None)
-@given(data=st.data())
-def test_damaged_files_give_points_or_one_line(tmp_path_factory, data):
-    path = ascii_ply(tmp_path_factory.getbasetemp() / "damaged.ply")
-    whole = path.read_bytes()
-    if data.draw(st.booleans()):
-        body = np.hstack([XYZ, XYZ[:, :1]]).tobytes()
-        whole = header("binary_big_endian", *AXES, "float w") + body
-    damaged = bytearray(whole)
-    for at in data.draw(st.lists(st.integers(0, len(whole) - 1), max_size=4)):
-        damaged[at] = data.draw(st.integers(0, 255))
-    del damaged[data.draw(st.integers(0, len(whole))) :]
-    path.write_bytes(damaged)
-    message = f"{path}: fine"
-    try:
-        assert np.isfinite(read_points(path).xyz).all()
-    except SceneError as error:
-        message = str(error)
-    assert message.startswith(str(path))
-    assert "\n" not in message
 
 
 def looking(position: np.ndarray, target: np.ndarray, up: tuple = (0, 0, 1)) -> np.ndarray:
@@ -164,7 +127,7 @@ def ring(centre: np.ndarray, radius: float, count: int = 12) -> list[np.ndarray]
     return [looking(centre + radius * offset, centre) for offset in around]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     centre=st.tuples(*[st.floats(-20, 20)] * 3).map(np.array),
     radius=st.floats(0.1, 50),
@@ -244,22 +207,6 @@ def test_other_captures_get_points_too(tmp_path, capture):
     assert in_sight(points.xyz, views).min() >= 2
 
 
-def test_cube_of_blender(tmp_path):
-    views = views_of(ring(np.zeros(3), 4), tmp_path)
-    points = random_points(views, 5000, cube=1.3)
-    assert np.abs(points.xyz).max() <= 1.3
-    np.testing.assert_allclose(points.xyz.mean(0), 0, atol=0.05)
-    np.testing.assert_allclose(points.xyz.std(0), 2.6 / np.sqrt(12), rtol=0.03)
-
-
-def test_same_seed_same_points(tmp_path):
-    views = views_of(ring(np.zeros(3), 4), tmp_path)
-    a, b, other = (random_points(views, 300, seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(a.xyz, b.xyz)
-    np.testing.assert_array_equal(a.rgb, b.rgb)
-    assert (a.xyz != other.xyz).any()
-
-
 def test_colour_is_the_mean_of_the_photos_that_show_a_point(tmp_path):
     """Two cameras side by side, each with a red left half; points in the middle of both are mixed."""
     photo = np.zeros((30, 40, 3), np.uint8)
@@ -275,10 +222,3 @@ def test_colour_is_the_mean_of_the_photos_that_show_a_point(tmp_path):
         count += inside
     np.testing.assert_allclose(points.rgb[:, 0], 255 * total / count, atol=0.51)
     assert (points.rgb[:, 1:] == 0).all()
-
-
-def test_photos_that_share_nothing_are_refused(tmp_path):
-    apart = [looking(np.array([0, 0, 0.0]), np.array([x, 0, 0.0])) for x in (1, -1)]
-    for poses in (apart, apart[:1]):
-        with pytest.raises(SceneError, match="no two photos show the same part"):
-            random_points(views_of(poses, tmp_path), 100)

@@ -13,7 +13,7 @@ from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.scene import Camera, Lens, View
-from sagesplat.scene.undistort import CAMERA_MODELS, distort, is_pinhole, pinhole, undistort
+from sagesplat.scene.undistort import CAMERA_MODELS, distort, pinhole, undistort
 
 WIDTH, HEIGHT = 64, 48
 COEFFICIENTS = {
@@ -114,13 +114,6 @@ def test_folding_and_absurd_lenses():
     assert np.hypot(32.5, 25.5) / K[0, 0] < 0.8165 * 1.01
     with pytest.raises(ValueError, match="no pinhole view fits"):
         pinhole(lens_of("RADIAL", (900.0, -3e4)))
-
-
-def test_lens_without_distortion_is_a_pinhole():
-    assert is_pinhole(lens_of("OPENCV", (0, 0, 0, 0)))
-    assert is_pinhole(lens_of("FOV", (0,)))
-    assert not is_pinhole(lens_of("OPENCV_FISHEYE", (0, 0, 0, 0)))
-    assert not is_pinhole(lens_of("SIMPLE_RADIAL", (1e-4,)))
 
 
 def colour(rays: np.ndarray) -> np.ndarray:

@@ -69,13 +69,6 @@ def test_the_filter_of_place_is_exact(config: CrfConfig) -> None:
     np.testing.assert_allclose(refine(p, photo, config), oracle(p, photo, config), atol=2e-3)
 
 
-def test_without_kernels_and_iterations_nothing_changes() -> None:
-    p, photo = smooth_probabilities(3, 9, 11), photo_of("noise", 9, 11)
-    np.testing.assert_allclose(refine(p, photo, CrfConfig(iterations=0)), p, atol=1e-4)
-    alone = CrfConfig(bilateral_weight=0, spatial_weight=0)
-    np.testing.assert_allclose(refine(p, photo, alone), p, atol=1e-4)
-
-
 @pytest.mark.parametrize("dimensions", [1, 2, 3, 5])
 def test_lattice_is_a_gaussian_filter(dimensions: int) -> None:
     rng = np.random.default_rng(dimensions)
@@ -87,7 +80,7 @@ def test_lattice_is_a_gaussian_filter(dimensions: int) -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(1, 5), st.floats(0.01, 300))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_lattice_is_linear_and_symmetric_and_keeps_no_negative(
     seed: int, dimensions: int, spread: float
 ) -> None:
@@ -110,31 +103,3 @@ def test_borders_move_to_the_edges_of_the_photo() -> None:
     labels = refine(p, photo).argmax(0)
     assert (p.argmax(0)[:, 30:36] == 0).all()
     assert (labels == (u > 30)).all()
-
-
-def test_a_grey_photo_only_smooths() -> None:
-    p = np.full((2, 20, 20), 0.2, np.float32)
-    p[0] = 0.8
-    p[:, 10, 10] = p[::-1, 0, 0]  # a single pixel that says otherwise
-    assert (refine(p, np.full((20, 20, 3), 128, np.uint8)).argmax(0) == 0).all()
-
-
-def test_one_pixel_and_one_class() -> None:
-    one = np.array([0.3, 0.7], np.float32).reshape(2, 1, 1)
-    q = refine(one, np.zeros((1, 1, 3), np.uint8))
-    assert q.shape == (2, 1, 1)
-    assert q[1] > 0.7
-    assert (refine(np.ones((1, 5, 4), np.float32), photo_of("noise", 5, 4)) == 1).all()
-
-
-def test_impossible_labels_are_finite() -> None:
-    p = np.zeros((3, 8, 8), np.float32)
-    p[0, :, :4], p[1, :, 4:] = 1, 1
-    q = refine(p, photo_of("edges", 8, 8))
-    assert np.isfinite(q).all()
-    assert (q[2] < 1e-3).all()
-
-
-def test_same_bits_each_time() -> None:
-    p, photo = smooth_probabilities(4, 20, 20), photo_of("garden", 20, 20)
-    assert refine(p, photo).tobytes() == refine(p, photo).tobytes()

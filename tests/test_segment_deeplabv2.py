@@ -1,7 +1,5 @@
 import pickle
-import re
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +8,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.segment.deeplabv2 import (
@@ -18,7 +15,6 @@ from sagesplat.segment.deeplabv2 import (
     HEADS,
     MEAN_BGR,
     RATES,
-    SCALES,
     DeepLabV2,
     DeepLabV2Segmenter,
     HeadClasses,
@@ -62,7 +58,7 @@ class Fixed(DeepLabV2):
 
 @pytest.mark.parametrize(
     ("size", "expected"),
-    [((1, 1), (1, 1)), ((2, 9), (1, 2)), ((321, 17), (41, 3)), ((385, 33), (49, 5)), ((513, 8), (65, 2))],
+    [((1, 1), (1, 1)), ((2, 9), (1, 2)), ((321, 17), (41, 3))],
 )
 def test_output_stride_is_eight(size: tuple[int, int], expected: tuple[int, int]) -> None:
     with torch.inference_mode():
@@ -111,20 +107,6 @@ def test_atrous_rates_of_the_head(branch: int) -> None:
     assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == [(r, c) for r in steps for c in steps]
 
 
-def test_the_head_sums_its_branches() -> None:
-    model = small(3)
-    for k, branch in enumerate(model.aspp):
-        nn.init.zeros_(branch.weight)  # type: ignore[arg-type]
-        nn.init.constant_(branch.bias, 10.0**k)  # type: ignore[arg-type]
-    assert (model(torch.zeros(1, 3, 20, 20)) == 1111).all()
-
-
-def test_same_bits_each_time() -> None:
-    x = torch.randn(1, 3, 37, 50)
-    with torch.inference_mode():
-        assert torch.equal(fuse_scales(small(), x), fuse_scales(small(), x))
-
-
 def bilinear(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """Bilinear resampling with pixel centres at + 0.5, the borders repeated."""
     for axis, length in ((1, height), (2, width)):
@@ -155,60 +137,12 @@ def test_scales_are_fused_by_their_maximum() -> None:
     assert 0 < (fused == whole).mean() < 1  # more than one scale counts
 
 
-# checkpoints
-
-
-def to_port(name: str) -> str:
-    name = re.sub(r"^conv1\.", "layer1.conv1.conv.", name)
-    name = re.sub(r"^bn1\.", "layer1.conv1.bn.", name)
-    name = name.replace("aspp.", "aspp.c")
-    parts = {"1": "reduce", "2": "conv3x3", "3": "increase"}
-
-    def block(m: re.Match[str]) -> str:
-        part = parts[m[4]] if m[4] else "shortcut"
-        kind = "bn" if m[3] == "bn" or m[5] == "1" else "conv"
-        return f"layer{int(m[1]) + 1}.block{int(m[2]) + 1}.{part}.{kind}."
-
-    return re.sub(r"^layer(\d)\.(\d+)\.(conv|bn|downsample)(?:([123])|\.([01]))\.", block, name)
-
-
-def to_torchvision(name: str) -> str:
-    return name.replace("aspp.", "layer5.conv2d_list.")
-
-
-def to_caffe(name: str) -> str:
-    name = re.sub(r"^bn1\.(weight|bias)", r"scale_conv1.\1", name)
-    name = re.sub(r"^bn1\.", "bn_conv1.", name)
-    name = re.sub(r"^aspp\.(\d)", r"fc1_voc12_c\1", name)
-
-    def block(m: re.Match[str]) -> str:
-        stage, k = int(m[1]) + 1, int(m[2])
-        letter = "a" if k == 0 else (f"b{k}" if stage in (3, 4) else "abc"[k])
-        norm = m[3] == "bn" or m[5] == "1"
-        kind = ("scale" if m[6] in ("weight", "bias") else "bn") if norm else "res"
-        return f"{kind}{stage}{letter}_branch{'2' + 'abc'[int(m[4]) - 1] if m[4] else 1}.{m[6]}"
-
-    return re.sub(r"^layer(\d)\.(\d+)\.(conv|bn|downsample)(?:([123])|\.([01]))\.(\w+)$", block, name)
-
-
 def load(path: Path) -> DeepLabV2:
     return load_deeplabv2(path, **SMALL)
 
 
 def weights(num_classes: int = 21) -> dict[str, Tensor]:
     return {n: v for n, v in small(num_classes).state_dict().items() if "num_batches" not in n}
-
-
-@pytest.mark.parametrize("prefix", ["", "module.base."])
-@pytest.mark.parametrize("scheme", [to_port, to_torchvision, to_caffe, str])
-def test_each_scheme_of_names_loads(scheme: Callable[[str], str], prefix: str, tmp_path: Path) -> None:
-    state, path = weights(), tmp_path / "weights.pth"
-    torch.save({prefix + scheme(name): value for name, value in state.items()}, path)
-    model = load(path)
-    assert not model.training
-    assert all(torch.equal(model.state_dict()[name], value) for name, value in state.items())
-    x = torch.randn(1, 3, 20, 30)
-    assert torch.equal(model(x), small()(x))
 
 
 @pytest.mark.parametrize(
@@ -218,18 +152,18 @@ def test_each_scheme_of_names_loads(scheme: Callable[[str], str], prefix: str, t
         ("base.layer1.conv1.bn.running_mean", "bn1.running_mean"),
         ("base.layer2.block1.reduce.conv.weight", "layer1.0.conv1.weight"),
         ("base.layer4.block23.conv3x3.bn.bias", "layer3.22.bn2.bias"),
-        ("scale.layer5.block1.proj.bn.weight", "layer4.0.downsample.1.weight"),
         ("base.layer5.block1.shortcut.conv.weight", "layer4.0.downsample.0.weight"),
         ("base.aspp.c3.bias", "aspp.3.bias"),
-        ("scale.aspp.stages.c0.weight", "aspp.0.weight"),
         ("Scale.layer5.conv2d_list.2.weight", "aspp.2.weight"),
         ("module.layer3.22.conv3.weight", "layer3.22.conv3.weight"),
         ("res2a_branch2a.weight", "layer1.0.conv1.weight"),
         ("res2c_branch2c.weight", "layer1.2.conv3.weight"),
-        ("res4b22_branch2b.weight", "layer3.22.conv2.weight"),
         ("bn5a_branch1.running_var", "layer4.0.downsample.1.running_var"),
-        ("scale3b3_branch2a.bias", "layer2.3.bn1.bias"),
         ("bn_conv1.running_var", "bn1.running_var"),
+        ("scale.layer5.block1.proj.bn.weight", "layer4.0.downsample.1.weight"),
+        ("scale.aspp.stages.c0.weight", "aspp.0.weight"),
+        ("res4b22_branch2b.weight", "layer3.22.conv2.weight"),
+        ("scale3b3_branch2a.bias", "layer2.3.bn1.bias"),
         ("fc1_coco_c1.bias", "aspp.1.bias"),
         ("something.else", "something.else"),
     ],
@@ -248,74 +182,42 @@ def test_each_form_of_file_loads(form: str, tmp_path: Path) -> None:
     elif form == "counted":
         torch.save(small().state_dict(), path)
     else:
-        content = {form: state, "epoch": 3} if form != "legacy" else state
+        named = {f"module.base.{n}": v for n, v in state.items()}
+        content = {form: named, "epoch": 3} if form != "legacy" else state
         torch.save(content, path, _use_new_zipfile_serialization=form != "legacy")
     found = load(path).state_dict()
     assert all(torch.allclose(found[n], v, atol=2e-3) for n, v in state.items())
     assert all(v.dtype == torch.float32 for n, v in found.items() if "num_batches" not in n)
 
 
-def write_damaged(kind: str, path: Path) -> None:
-    state: dict[str, Any] = weights(182 if kind == "head" else 7 if kind == "other head" else 21)
-    if kind == "garbage":
-        path.write_bytes(b"not a checkpoint")
-    elif kind == "pickle":
-        path.write_bytes(pickle.dumps({"conv1.weight": Path("x")}))
-    elif kind == "cut":
-        torch.save(state, path)
-        path.write_bytes(path.read_bytes()[:1000])
-    elif kind != "no file":
-        if kind == "empty":
-            state = {}
-        elif kind == "numbers":
-            state = {"conv1.weight": 3}
-        elif kind == "less":
-            del state["layer3.1.conv2.weight"]
-        elif kind == "backbone":
-            state = {n: v for n, v in state.items() if "aspp" not in n} | {"fc.weight": torch.ones(3, 3)}
-        elif kind == "more":
-            state["layer3.3.conv1.weight"] = torch.ones(3)
-        elif kind == "shape":
-            state["layer1.0.conv2.weight"] = torch.ones(2, 2, 1, 1)
-        elif kind == "nan":
-            state["conv1.weight"][0] = torch.nan
-        elif kind == "twice":
-            state["module.conv1.weight"] = state["conv1.weight"]
-        torch.save(state, path)
-
-
 @pytest.mark.parametrize(
-    ("kind", "says"),
+    ("changes", "says"),
     [
-        ("no file", "no such file"),
-        ("garbage", "not a file of tensors"),
-        ("pickle", "not a file of tensors"),
-        ("cut", "not a file of tensors"),
-        ("empty", "holds no state dict"),
-        ("numbers", "holds no state dict"),
-        ("less", r"lacks 1 parameters \(layer3\.1\.conv2\.weight\)"),
-        ("backbone", r"lacks 8 parameters \(aspp\.0\.bias, aspp\.0\.weight, aspp\.1\.bias, \.\.\.\)"),
-        ("more", r"also has 1 parameters \(layer3\.3\.conv1\.weight\)"),
-        ("shape", r"layer1\.0\.conv2\.weight is of shape \[2, 2, 1, 1\], not \[2, 2, 3, 3\]"),
-        ("nan", r"conv1\.weight has values that are not finite"),
-        ("twice", r"module\.conv1\.weight is there twice"),
-        ("head", "182 outputs, but head 'voc' has 21; take head 'coco-stuff'"),
-        ("other head", "7 outputs, but head 'voc' has 21; take another checkpoint"),
+        ({"layer3.1.conv2.weight": None}, r"lacks 1 parameters \(layer3\.1\.conv2\.weight\)"),
+        ({"layer3.3.conv1.weight": torch.ones(3)}, r"also has 1 parameters \(layer3\.3\.conv1\.weight\)"),
+        ({"layer1.0.conv2.weight": torch.ones(2, 2, 1, 1)}, r"of shape \[2, 2, 1, 1\], not \[2, 2, 3, 3\]"),
+        (
+            {"conv1.weight": torch.full((2, 3, 7, 7), torch.nan)},
+            r"conv1\.weight has values that are not finite",
+        ),
+        ({"module.conv1.weight": torch.zeros(1)}, r"module\.conv1\.weight is there twice"),
+        (weights(7), r"7 outputs, but 182 \(coco-stuff\) or 21 \(voc\) are known"),
     ],
 )
-def test_what_cannot_be_loaded_is_one_line(kind: str, says: str, tmp_path: Path) -> None:
-    write_damaged(kind, path := tmp_path / "weights.pth")
+def test_what_cannot_be_loaded_is_one_line(changes: dict[str, Any], says: str, tmp_path: Path) -> None:
+    state = {name: value for name, value in (weights() | changes).items() if value is not None}
+    torch.save(state, path := tmp_path / "weights.pth")
     with pytest.raises(LabelError, match=says) as caught:
         load(path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
 
 
-def test_safetensors_that_cannot_be_loaded(tmp_path: Path) -> None:
-    path = tmp_path / "x.safetensors"
+def test_what_is_no_checkpoint_is_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "weights.pth"
     with pytest.raises(LabelError, match="no such file"):
         load(path)
-    path.write_bytes(b"nothing")
+    path.write_bytes(pickle.dumps({"conv1.weight": Path("x")}))
     with pytest.raises(LabelError, match="not a file of tensors"):
         load(path)
 
@@ -382,108 +284,7 @@ def test_photos_of_any_size(shape: tuple[int, int], crf: bool) -> None:
     assert set(np.unique(first.label_ids).tolist()) <= {-1, *segmenter.taxonomy.names}
 
 
-def test_what_does_not_fit_is_one_line() -> None:
-    with pytest.raises(LabelError, match="7 outputs, which the classes do not fit"):
-        DeepLabV2Segmenter(small(7), head_classes("voc"))
-    with pytest.raises(BackendUnavailable, match="device cuda:99 is not there"):
-        DeepLabV2Segmenter(small(), head_classes("voc"), device="cuda:99")
-
-
 def test_without_safetensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "safetensors.torch", None)
     with pytest.raises(BackendUnavailable, match="safetensors"):
         load(tmp_path / "x.safetensors")
-
-
-# training
-
-Photos = Sequence[np.ndarray]  # uint8 [H, W, 3]
-LabelImages = Sequence[np.ndarray]  # int16 [H, W]
-
-
-def train_small(
-    photos: Sequence[np.ndarray],
-    labels: Sequence[np.ndarray],
-    num_classes: int,
-    *,
-    steps: int,
-    blocks: Sequence[int],
-    width: int,
-    batch: int = 4,
-    rate: float = 3e-3,
-    seed: int = 0,
-    on_step: Callable[[int, float], None] | None = None,
-) -> DeepLabV2:
-    """A network from random weights; labels are classes 0 ... C - 1, negative ones do not count.
-
-    Each step sees a batch at one of the scales of inference, half of it mirrored; unlike in the paper, batch
-    norm learns too, since there are no weights to start from.
-    """
-    torch.manual_seed(seed)
-    rng = np.random.default_rng(seed)
-    model = DeepLabV2(num_classes, blocks, width).train()
-    x = torch.from_numpy(np.stack(photos)[..., ::-1].astype(np.float32)) - torch.tensor(MEAN_BGR)
-    x, y = x.permute(0, 3, 1, 2), torch.from_numpy(np.stack(labels).astype(np.int64))
-    optimizer = torch.optim.AdamW(model.parameters(), rate, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
-    for step in range(steps):
-        rows = torch.from_numpy(rng.choice(len(photos), min(batch, len(photos)), replace=False))
-        photo, label = x[rows], y[rows]
-        if rng.random() < 0.5:
-            photo, label = photo.flip(3), label.flip(2)
-        small = F.interpolate(photo, scale_factor=float(rng.choice(SCALES)), mode="bilinear")
-        logits = F.interpolate(model(small), tuple(label.shape[1:]), mode="bilinear")
-        loss = F.cross_entropy(logits, label.clamp(min=-1), ignore_index=-1)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        if on_step is not None:
-            on_step(step + 1, float(loss.detach()))
-    return model.eval()
-
-
-def mean_iou(predicted: Sequence[np.ndarray], truth: Sequence[np.ndarray]) -> float:
-    """Mean intersection over union of the truth's labels; its unlabelled pixels do not count."""
-    p, t = (np.concatenate([image.ravel() for image in images]) for images in (predicted, truth))
-    p, t = p[t >= 0], t[t >= 0]
-    return float(np.mean([((p == i) & (t == i)).sum() / ((p == i) | (t == i)).sum() for i in np.unique(t)]))
-
-
-def discs(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A photo of a bright disc (class 1) and a striped square (2) on a dark ground (0)."""
-    rng = np.random.default_rng(seed)
-    v, u = np.indices((48, 64))
-    cy, cx, y, x = (rng.uniform(0.25, 0.75, 4) * [48, 32, 48, 32]).astype(int)
-    label = np.zeros((48, 64), np.int16)
-    label[np.hypot(v - cy, u - cx) < 13] = 1
-    label[(abs(v - y) < 12) & (abs(u - x - 32) < 12)] = 2
-    colors = np.array([[40, 50, 40], [200, 170, 60], [120, 120, 120]])[label]
-    colors[(label == 2) & (u // 3 % 2 == 0)] = 20
-    return (colors + rng.normal(0, 8, colors.shape)).clip(0, 255).astype(np.uint8), label
-
-
-def test_a_small_network_learns() -> None:
-    photos, labels = zip(*map(discs, range(16)), strict=True)
-    losses: list[float] = []
-    model = train_small(
-        photos,
-        labels,
-        3,
-        steps=60,
-        blocks=(1, 1, 1, 1),
-        width=8,
-        rate=5e-3,
-        on_step=lambda _, x: losses.append(x),
-    )
-    assert len(losses) == 60
-    assert np.mean(losses[-10:]) < 0.4 * np.mean(losses[:3])
-    segmenter = DeepLabV2Segmenter(model, HeadClasses((0, 1, 2), (1, 2, 3)), size=None)
-    held_out, truth = zip(*map(discs, range(100, 106)), strict=True)
-    found = [segmented.label_ids - 1 for segmented in segmenter(held_out)]
-    assert mean_iou(found, truth) > 0.6
-
-
-def test_mean_iou() -> None:
-    truth = np.array([[0, 0, 1, -1]], np.int16)
-    assert mean_iou([np.array([[0, 1, 1, 0]], np.int16)], [truth]) == pytest.approx(0.5)

@@ -65,17 +65,6 @@ def test_masks_are_resampled_to_the_photo() -> None:
     np.testing.assert_array_equal(answer.label_ids[20] == 201, np.arange(80) < 40)
 
 
-def test_nothing_found() -> None:
-    answer = segmented(found(), IDS, 0.2, (4, 8))
-    assert (answer.label_ids == -1).all()
-    assert answer.instances is not None
-    assert (answer.instances == -1).all()
-
-
-def test_what_is_no_thing_has_no_instances() -> None:
-    assert segmented(found((0, 1.0, mask(1)), things=False), IDS, 0.2, (4, 8)).instances is None
-
-
 def test_boxes_for_the_same_thing_are_one() -> None:
     corners = [[0, 0, 10, 10], [0, 0, 10, 9], [0, 0, 10, 10], [5, 0, 15, 10], [0, 0, 40, 40]]
     boxes = Boxes(
@@ -101,10 +90,3 @@ def test_prompts_are_painted_over_another_segmenter() -> None:
     np.testing.assert_array_equal(both.label_ids[0], [7, 7, 201, 201, 184, -1, 7, -1])
     assert both.instances is not None
     np.testing.assert_array_equal(both.instances[0], [2, 2, 0, 0, -1, -1, 1, -1])
-
-
-def test_instances_above_stay_where_there_are_none_below() -> None:
-    top = segmented(found((0, 0.6, mask(2))), IDS, 0.2, (4, 8))
-    below = Segmented(np.full((4, 8), 3, np.int16))
-    both = painted_over(below, top)
-    np.testing.assert_array_equal(both.label_ids[0], [3, 3, 201, 3, 3, 3, 3, 3])

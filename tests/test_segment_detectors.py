@@ -66,14 +66,6 @@ def test_more_prompts_than_a_text_holds_are_asked_for_in_several_passes(folders:
     assert set(together(photo(), 0.01).prompts.tolist()) == set(range(6))
 
 
-def test_separators_in_a_prompt_do_not_split_it(folders: dict[str, Path]) -> None:
-    said: list[str] = []
-    plain = loaded(folders["dino"], ["stone fountain", "ivy"], said)
-    dotted = loaded(folders["dino"], ["stone. fountain?", "..ivy."], said)
-    assert dotted.score.tokens == plain.score.tokens
-    assert not said
-
-
 def test_words_that_are_not_known_or_too_many_are_said(folders: dict[str, Path]) -> None:
     said: list[str] = []
     detect = loaded(folders["dino"], ["喷泉", "ivy " * 20], said)

@@ -3,7 +3,7 @@
 import pytest
 
 from sagesplat.segment.coco import NAMES
-from sagesplat.segment.display_names import categories, meant, title_of, titles
+from sagesplat.segment.display_names import meant, title_of, titles
 
 
 @pytest.mark.parametrize(
@@ -15,10 +15,6 @@ from sagesplat.segment.display_names import categories, meant, title_of, titles
 )  # fmt: skip
 def test_titles(name: str, title: str) -> None:
     assert title_of(name) == title
-
-
-def test_one_category_is_not_plural() -> None:
-    assert (categories(1), categories(8)) == ("1 category", "8 categories")
 
 
 def test_names_that_become_the_same_stay_as_they_are() -> None:
@@ -34,10 +30,6 @@ def test_no_two_of_cocos_share_a_title() -> None:
     shown = titles(NAMES).values()
     assert len(set(shown)) == len(NAMES)
     assert not [title for title in shown if "-" in title]
-
-
-def test_a_name_of_suffixes_alone_is_its_own_title() -> None:
-    assert [title_of(name) for name in ("-merged", "-", "a-stuff")] == ["-merged", "-", "a"]
 
 
 def test_what_is_typed_is_a_name_or_its_title() -> None:

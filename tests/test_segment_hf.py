@@ -14,7 +14,7 @@ from PIL import Image
 from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
 from sagesplat.segment import coco, panoptic
 from sagesplat.segment.hf import HfSegmenter, class_ids
-from sagesplat.segment.hub import torch_device
+from sagesplat.segment.hub import prepared, torch_device
 from sagesplat.segment.segmenters import Segmenter
 
 transformers: Any = pytest.importorskip("transformers", reason="needs sagesplat[hf]")
@@ -127,7 +127,7 @@ def test_labels_are_those_of_the_network_s_own_post_processing(
 ) -> None:
     segmenter = HfSegmenter(folders[kind], device="cpu")
     (found,) = segmenter([noise(*size)])
-    inputs = segmenter._prepare([noise(*size)])
+    inputs = prepared(segmenter._processor, [noise(*size)], "tiny")
     more = {} if segmenter._task is None else {"task_inputs": segmenter._task}
     with torch.inference_mode():
         pixels = inputs["pixel_values"]
@@ -198,15 +198,7 @@ def test_scores_are_summed_and_at_most_1(folders: dict[str, Path]) -> None:
     weights = torch.tensor([[0.6, 0, 0, 0], [0.4, 0, 0.2, 0], [0, 0.1, 0, 0]])
     scores = segmenter._scores(weights, half, inputs)
     np.testing.assert_allclose(scores[:, 0, 0], [0.5, 0.05, 0.1, 0], atol=1e-6)
-    found = segmenter._answer(scores, 8, 8)
-    assert (found.label_ids == min(IDS)).all()
-
-
-def test_photos_no_network_can_take(folders: dict[str, Path]) -> None:
-    segmenter = HfSegmenter(folders["eomt"], device="cpu")
-    with pytest.raises(LabelError, match="cannot take a photo of 300 x 1 pixels") as caught:
-        segmenter([noise(1, 300)])
-    assert "\n" not in str(caught.value)
+    assert (segmenter._ids[scores.argmax(0)] == min(IDS)).all()
 
 
 def test_names_of_classes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,18 +221,6 @@ def test_names_of_classes(monkeypatch: pytest.MonkeyPatch) -> None:
         class_ids(generic, "mask2former", "m")
 
 
-def test_a_network_without_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    threads: list[int] = []
-    monkeypatch.setattr(torch, "set_num_threads", threads.append)
-    segmenter = HfSegmenter(
-        save(tmp_path, "eomt", [f"LABEL_{i}" for i in range(133)]), device="cpu", threads=1
-    )
-    assert segmenter.taxonomy.names == dict(sorted(coco.NAMES.items()))
-    assert segmenter.note is not None
-    assert segmenter.revision is None
-    assert threads == [1]
-
-
 def test_a_network_from_the_cache(
     tmp_path: Path, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,19 +228,13 @@ def test_a_network_from_the_cache(
 
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
-    for name, revision, command in (
-        ("tue-mps/tiny", None, "hf download tue-mps/tiny, then set HF_HUB_OFFLINE=1"),
-        ("tiny", "v2", "hf download tiny --revision v2, then"),
-    ):
-        with pytest.raises(BackendUnavailable, match=command) as caught:
-            HfSegmenter(name, device="cpu", revision=revision)
-        assert "\n" not in str(caught.value)
+    with pytest.raises(BackendUnavailable, match="hf download tiny, then set HF_HUB_OFFLINE=1"):
+        HfSegmenter("tiny", device="cpu")
     commit, repository = "0123456789" * 4, tmp_path / "models--tue-mps--tiny"
     shutil.copytree(folders["eomt"], repository / "snapshots" / commit)
     (repository / "refs").mkdir()
     (repository / "refs" / "main").write_text(commit)
     segmenter = HfSegmenter("tue-mps/tiny", device="cpu")
-    assert segmenter.revision == commit
     assert segmenter.note is None
 
 
@@ -272,39 +246,20 @@ def test_unusable_networks(
     def copy(name: str) -> Path:
         return shutil.copytree(folders["eomt"], tmp_path / name)
 
-    (tmp_path / "empty").mkdir()
     (tmp_path / "bert").mkdir()
     (tmp_path / "bert" / "config.json").write_text('{"model_type": "bert"}')
-    (copy("json") / "config.json").write_text("{")
-    (copy("kind") / "config.json").write_text('{"model_type": "no_such_thing"}')
     weights = copy("pickle") / "model.safetensors"
     torch.save(load_file(weights), weights.with_name("pytorch_model.bin"))
     weights.unlink()
-    weights = copy("damaged") / "model.safetensors"
-    weights.write_bytes(weights.read_bytes()[:1000])
     weights = copy("part") / "model.safetensors"
     tensors = load_file(weights)
     save_file(
         {key: t for key, t in tensors.items() if "class_predictor" not in key}, weights, {"format": "pt"}
     )
-    (copy("processor") / "preprocessor_config.json").unlink()
-    config = json.loads((copy("classes") / "config.json").read_text())
-    config["id2label"]["4"] = "dog"
-    (tmp_path / "classes" / "config.json").write_text(json.dumps(config))
-    cases: list[tuple[Path | str, str]] = [
-        (tmp_path / "none", "no such folder"),
-        ("./none", "no such folder"),
-        ("a/b/c", "no such folder"),
-        ("", "no such folder"),
-        (tmp_path / "empty", "no network of transformers"),
-        (tmp_path / "json", "no network of transformers"),
-        (tmp_path / "kind", "no network of transformers"),
+    cases = [
         (tmp_path / "bert", "a network of kind bert; take one of detr, eomt"),
         (tmp_path / "pickle", "cannot be loaded .*safetensors"),
-        (tmp_path / "damaged", "cannot be loaded"),
         (tmp_path / "part", "weights lack 2 parameters .class_predictor.bias"),
-        (tmp_path / "processor", "cannot be loaded"),
-        (tmp_path / "classes", "cannot be loaded"),
     ]
     for model, complaint in cases:
         with pytest.raises(LabelError, match=complaint) as caught:
@@ -314,41 +269,19 @@ def test_unusable_networks(
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_is_not_installed(
-    tmp_path: Path, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not transformers.utils.is_timm_available():
-        shutil.copytree(folders["detr"], tmp_path / "timm")
-        config = transformers.DetrConfig(**labels(NAMES))  # with timm's ResNet, as published
-        config.save_pretrained(tmp_path / "timm")
-        with pytest.raises(BackendUnavailable, match="timm") as caught:
-            HfSegmenter(tmp_path / "timm", device="cpu")
-        assert "\n" not in str(caught.value)
+def test_without_transformers(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(BackendUnavailable, match=r"pip install 'sagesplat\[hf\]'"):
         HfSegmenter(folders["eomt"], device="cpu")
 
 
 def test_devices(folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert torch_device("cpu") == torch.device("cpu")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert torch_device("auto") == torch.device("cpu")
-    with pytest.raises(BackendUnavailable, match="0 CUDA devices"):
-        torch_device("cuda")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert torch_device("auto") == torch.device("cuda", 0)
-    assert torch_device("cuda:1") == torch.device("cuda", 1)
     with pytest.raises(BackendUnavailable, match="2 CUDA devices"):
         torch_device("cuda:2")
     segmenter = HfSegmenter(folders["eomt"], device="cpu")
-
-    def full(**_: Any) -> Any:
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-
-    segmenter._model = full
-    with pytest.raises(OutOfMemory, match="2 photos at once"):
-        segmenter([noise(8, 8)] * 2)
 
     def full_machine(**_: Any) -> Any:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")

@@ -11,12 +11,9 @@ from PIL import Image
 
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.labels import as_json, labelled
-from sagesplat.formats.splat import Splat
 from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.io.files import write_json
-from sagesplat.segment.display_names import title_of
-from sagesplat.segment.instances import parse_instances, read_instances, wanted_ids, write_instances
+from sagesplat.segment.instances import read_instances, wanted_ids, write_instances
 from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.segment.select import select, select_mask
 
@@ -34,7 +31,7 @@ def gaussians(ids: list[int]) -> Gaussians:
     )  # fmt: skip
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(numbers=st.lists(st.integers(-1, 4), min_size=6, max_size=6))
 def test_instances_come_back_as_the_same_partition(numbers: list[int], tmp_path_factory) -> None:
     path = tmp_path_factory.mktemp("instances") / "a.png"
@@ -48,25 +45,15 @@ def test_instances_come_back_as_the_same_partition(numbers: list[int], tmp_path_
 
 def test_instance_files_of_another_size_or_kind_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    with pytest.raises(LabelError, match="no such file"):
-        read_instances(path)
-    path.write_bytes(b"\x89PNG\r\n\x1a\nnothing")
-    with pytest.raises(LabelError, match="not a readable PNG"):
-        read_instances(path)
     Image.new("RGB", (3, 2)).save(path)
     with pytest.raises(LabelError, match="mode RGB"):
         read_instances(path)
     write_instances(path, np.zeros((2, 3), np.int16))
     with pytest.raises(LabelError, match="3 x 2 pixels where the photo has 4 x 2"):
         read_instances(path, (2, 4))
-    Image.fromarray(np.arange(90 * 90, dtype=np.uint16).reshape(90, 90)).save(path)
-    with pytest.raises(LabelError, match="8,100 instances in one photo"):
-        read_instances(path)
 
 
 def test_categories_are_named_one_by_one_or_all_at_once() -> None:
-    assert parse_instances(" chair, car ,chair") == ("chair", "car")
-    assert parse_instances("") == ()
     assert wanted_ids({62: "chair", 184: "tree-merged", 201: "ivy"}, ("things",)) == [62, 201]
     assert wanted_ids({62: "chair", 184: "tree-merged"}, ("*",)) == [62, 184]
     with pytest.raises(LabelError, match="no category 'sofa'; there are chair"):
@@ -75,18 +62,13 @@ def test_categories_are_named_one_by_one_or_all_at_once() -> None:
 
 def test_parents_are_kept_and_checked(tmp_path: Path) -> None:
     path = tmp_path / "parents.json"
-    assert read_parents(path) == {}
     write_parents(path, {"chair 1": "chair"})
     assert read_parents(path) == {"chair 1": "chair"}
     write_json(path, {"format": "sagesplat-parents", "version": 1, "parents": {"a": "b", "b": "c"}})
     with pytest.raises(RunError, match="an instance itself"):
         read_parents(path)
-    for wrong in ([], {}, {"format": "sagesplat-parents", "version": 1, "parents": {"a": 1}}):
-        write_json(path, wrong)
-        with pytest.raises(RunError, match=r"parents\.json"):
-            read_parents(path)
     write_parents(path, {})
-    assert not path.exists()
+    assert read_parents(path) == {}
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.sog"])
@@ -110,20 +92,6 @@ def test_the_dictionary_beside_a_ply_names_labels_whose_comments_were_dropped(tm
     assert (splat.parents, splat.gaussians.label_ids.tolist()) == ({201: "chair"}, [62, 201])
 
 
-@settings(max_examples=60, deadline=None)
-@given(at=st.integers(0, 400), byte=st.integers(0, 255))
-def test_damaged_labels_are_read_or_refused(at: int, byte: int) -> None:
-    g = gaussians([62, 201])
-    content = bytearray(as_json(g.label_ids, NAMES, PARENTS))
-    content[at % len(content)] = byte
-    try:
-        splat = labelled(Splat(g, "PLY"), bytes(content))
-    except ValueError:
-        return
-    assert len(splat.gaussians) == 2
-    assert all(0 <= label < 2**15 for label in splat.parents)
-
-
 def test_a_category_selects_its_instances_too() -> None:
     g = gaussians([62, 184, 201, 202, 202])
     assert select_mask(g, "chair", NAMES, PARENTS).tolist() == [True, False, True, True, True]
@@ -139,9 +107,3 @@ def test_in_blocks_a_name_means_all_blocks_of_it() -> None:
     assert select_mask(g, "chair 1", names, parents).tolist() == [False, True, False, False, True]
     assert select_mask(g, "chair", names, parents).tolist() == [True, True, False, True, True]
     assert select_mask(g, "chair@1", names, parents).tolist() == [False, False, False, True, True]
-
-
-def test_titles_of_instances_keep_their_number() -> None:
-    assert [title_of(name) for name in ("tree-merged 2", "chair 1", "7", "grass-merged")] == [
-        "tree 2", "chair 1", "7", "grass",
-    ]  # fmt: skip

@@ -11,12 +11,10 @@ import torch
 from PIL import Image
 from text_networks import photo, save, transformers
 
-from sagesplat.segment.detections import Boxes
 from sagesplat.segment.hub import load_image_processor, load_tokenizer, quiet, read_config
 from sagesplat.segment.mask_networks import (
     BOX_FAMILIES,
     WORD_FAMILIES,
-    BoxFinder,
     BoxMasks,
     ClipSeg,
     Sam3,
@@ -88,27 +86,6 @@ def test_sam2_is_published_as_the_network_for_videos(folders: dict[str, Path], t
     (folder / "config.json").write_text(json.dumps(about))
     video, image = box_masks(folder), box_masks(folders["sam2"])
     np.testing.assert_array_equal(video(photo(), CORNERS), image(photo(), CORNERS))
-
-
-def test_boxes_and_their_masks_are_what_is_found() -> None:
-    boxes = Boxes(
-        np.array([1, 0]), np.array([0.9, 0.4], np.float32), CORNERS[:2], np.array([0.4, 0.9], np.float32)
-    )
-    masks = np.arange(2 * 3 * 4, dtype=np.float32).reshape(2, 3, 4)
-    seen: list[Any] = []
-
-    def detect(image: np.ndarray, threshold: float) -> Boxes:
-        seen.append(threshold)
-        return boxes
-
-    found = BoxFinder(detect, lambda image, corners: masks[: len(corners)], 0.3)(photo())
-    assert seen == [0.3]
-    np.testing.assert_array_equal(found.masks, masks)
-    assert (found.prompts.tolist(), found.things) == ([1, 0], True)
-    none = Boxes(boxes.prompts[:0], boxes.scores[:0], boxes.corners[:0], boxes.best)
-    found = BoxFinder(lambda *_: none, lambda *_: pytest.fail("no box, no mask"), 0.3)(photo())
-    assert len(found.masks) == 0
-    np.testing.assert_array_equal(found.best, boxes.best)
 
 
 def test_clipseg_has_a_mask_for_each_prompt_above_the_threshold(folders: dict[str, Path]) -> None:

@@ -1,5 +1,4 @@
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from sagesplat.core.errors import LabelError, SceneError
+from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.undistort import pinhole
-from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, prepare_folder, read_mask, write_mask
 
@@ -202,13 +200,6 @@ def test_label_images_of_raw_photos_follow_the_undistorted_ones(tmp_path, label,
     assert sure.mean() > 0.8
 
 
-def test_of_two_photos_of_one_size_the_raw_one_is_meant(tmp_path):
-    scene, expected, sure = undistorted_capture(tmp_path / "capture", size=(128, 96))
-    save(tmp_path / "m" / "a.png", taken())
-    masks, _ = imported(scene, tmp_path / "m")
-    np.testing.assert_array_equal(masks[scene.views[0]][sure], expected[sure])
-
-
 def test_label_images_of_undistorted_photos_stay(tmp_path):
     scene, expected, _ = undistorted_capture(tmp_path / "capture")
     save(tmp_path / "m" / "a.png", np.where(expected == -1, 255, expected).astype(np.uint8))
@@ -232,57 +223,24 @@ def test_label_images_that_fit_both_or_none_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "damage",
-    [
-        lambda raw: [],
-        lambda raw: {"lenses": 3},
-        lambda raw: raw | {"photos": {"a.jpg": [1, 1]}},
-        lambda raw: raw | {"photos": {"a.jpg": [0, 9]}},
-        lambda raw: raw | {"photos": {"a.jpg": [0]}},
-        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"model": "NONE"}]},
-        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"params": [1e999, 1, 1, 1]}]},
-        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"width": 1e999}]},
-    ],
-)
-def test_a_damaged_report_of_poses_is_one_line(tmp_path, damage):
-    scene, _, _ = undistorted_capture(tmp_path / "capture")
-    save(tmp_path / "m" / "a.png", taken())
-    path = tmp_path / "capture" / "poses.json"
-    raw = json.loads(path.read_text())["raw"]
-    path.write_text(json.dumps({"raw": damage(raw)}))
-    message = r"poses\.json: not a report of poses \(.*\); find the poses again"
-    with pytest.raises(SceneError, match=message) as raised:
-        imported(scene, tmp_path / "m")
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
     ("pixels", "labels", "complaint"),
     [
         (IDS, None, "no labels.json"),
         (IDS, {"labels": {"3": "car"}}, "unknown ids 184"),
-        (IDS, {"labels": {}}, "names no label"),
-        (IDS, {"names": {"3": "car"}}, "not of the form"),
         (IDS, ["car"], "not of the form"),
-        (IDS, {"labels": {"car": 3}}, "not of the form"),
-        (IDS, {"labels": {"3": 4}}, "named 4"),
         (IDS, {"labels": {"3": "car", "4": "car"}}, "name of its own"),
         (IDS, {"labels": {"3": "unlabelled"}}, '"unlabelled": 3'),
         (IDS, {"labels": {"40000": "car"}}, r"outside 0 \.\.\. 32767"),
-        (IDS, {"labels": {"-1": "car"}}, "outside 0"),
         (IDS, {"unlabelled": 3, "labels": {"3": "car"}}, "has a name too"),
-        (IDS, {"unlabelled": -1, "labels": {"3": "car"}}, "pixel value"),
         (np.zeros((2, 4, 3), np.uint8), LABELS, "mode RGB where one channel"),
         (np.full((4, 4), 3, np.uint8), LABELS, "4 x 4 pixels, but its photo has 4 x 2"),
-        (np.full((40, 83), 3, np.uint8), LABELS, "83 x 40 pixels"),
         (np.full((2, 4), 255, np.uint8), LABELS, "every pixel is unlabelled"),
     ],
 )
 def test_unusable_input(tmp_path, pixels, labels, complaint):
     save(tmp_path / "a.png", pixels, labels)
-    scene = scene_of("a.jpg") if len(pixels) < 40 else scene_of("a.jpg", width=400, height=200)
     with pytest.raises(LabelError, match=complaint) as caught:
-        import_masks(scene, tmp_path, tmp_path / "out")
+        import_masks(scene_of("a.jpg"), tmp_path, tmp_path / "out")
     message = str(caught.value)
     assert "\n" not in message
     assert message.startswith(str(tmp_path))
@@ -291,46 +249,24 @@ def test_unusable_input(tmp_path, pixels, labels, complaint):
 
 def test_unusable_folders(tmp_path):
     scene = scene_of("a.jpg")
-    with pytest.raises(LabelError, match="no such folder"):
-        import_masks(scene, tmp_path / "none", tmp_path / "out")
     save(tmp_path / "c.png", IDS)
     with pytest.raises(LabelError, match=r"no label image for any view; name them like the photos \(a\.png"):
         import_masks(scene, tmp_path, tmp_path / "out")
     with pytest.raises(LabelError, match="masks of the run itself"):
         import_masks(scene, tmp_path, tmp_path)
-    save(tmp_path / "a.png", IDS)
-    with pytest.raises(LabelError, match="same name but for the suffix"):
-        import_masks(scene_of("a.jpg", "a.png"), tmp_path, tmp_path / "out")
     for name in ("/etc/a.jpg", "../a.jpg"):
         with pytest.raises(LabelError, match="outside the image folder"):
             mask_path(tmp_path, scene_of(name).views[0])
-    (tmp_path / "labels.json").write_text("{")
-    with pytest.raises(LabelError, match="not readable as JSON"):
-        import_masks(scene, tmp_path, tmp_path / "out")
 
 
-def test_damaged_images_are_named(tmp_path):
-    """Whatever byte of a PNG is wrong: a label image or one line with its path."""
-    save(tmp_path / "a.png", np.random.default_rng(0).choice(np.array([3, 184], np.uint8), (20, 40)))
-    whole = (tmp_path / "a.png").read_bytes()
-    scene = scene_of("a.jpg")
-    messages = []
-    for at in range(0, len(whole), 2):
-        for damaged in (whole[:at], whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :]):
-            (tmp_path / "a.png").write_bytes(damaged)
-            try:
-                import_masks(scene, tmp_path, tmp_path / "out")
-            except LabelError as error:
-                messages.append(str(error))
-    assert len(messages) > len(whole) // 2
-    assert all(m.startswith(str(tmp_path / "a.png")) and "\n" not in m for m in messages)
-    jpeg = np.full((2, 4), 3, np.uint8)
-    Image.fromarray(jpeg).save(tmp_path / "a.png", format="JPEG")  # lossy ids are no ids
+def test_lossy_images_are_no_ids(tmp_path):
+    save(tmp_path / "a.png", IDS)
+    Image.fromarray(IDS).save(tmp_path / "a.png", format="JPEG")
     with pytest.raises(LabelError, match="not a readable PNG"):
-        import_masks(scene, tmp_path, tmp_path / "out")
+        import_masks(scene_of("a.jpg"), tmp_path, tmp_path / "out")
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.integers(0, 32767), min_size=1, max_size=5, unique=True), st.integers(0, 2**32 - 1))
 def test_masks_read_back_as_written(tmp_path_factory, ids, seed):
     taxonomy = Taxonomy({i: f"label {i}" for i in sorted(ids)})
@@ -347,22 +283,8 @@ def test_masks_of_another_scene_are_refused(tmp_path):
     scene = scene_of("a.jpg", "b.jpg")
     with pytest.raises(LabelError, match=r"4 x 2 pixels where the scene has 8 x 4"):
         Masks(tmp_path, Taxonomy({3: "car"}))[scene_of("a.jpg", width=8, height=4).views[0]]
-    with pytest.raises(LabelError, match=r"b\.png: no such file"):
-        Masks(tmp_path, Taxonomy({3: "car"}))[scene.views[1]]
     with pytest.raises(LabelError, match="unknown ids 3"):
         Masks(tmp_path, Taxonomy({4: "bus"}))[scene.views[0]]
-    with pytest.raises(LabelError, match=r"labels\.json: no such file"):
-        Taxonomy.read(tmp_path / "labels.json")
-
-
-def test_the_cache_keeps_what_fits(tmp_path):
-    taxonomy, scene = Taxonomy({3: "car"}), scene_of("a.jpg", "b.jpg")
-    for name in "ab":
-        write_mask(tmp_path / f"{name}.png", np.full((2, 4), 3, np.int16), taxonomy)
-    masks = Masks(tmp_path, taxonomy, cache_bytes=20)
-    assert all((masks[v] == 3).all() for v in scene.views)
-    assert masks[scene.views[0]] is masks[scene.views[0]]
-    assert masks[scene.views[1]] is not masks[scene.views[1]]
 
 
 def test_names_and_colors():
@@ -376,47 +298,8 @@ def test_names_and_colors():
     assert Taxonomy({9: "statue"}).color(9) == taxonomy.color(201)
 
 
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [
-        ("x" * 101, "101 characters"), ("a\x1b[31m", r"U\+001B"), ("a\ud800", "not UTF-8"), (" ", "blank"),
-        ("a\u202eb", r"U\+202E"), (" a", "begins or ends with a space"), (7, "no text"),
-    ],
-)  # fmt: skip
-def test_names_that_may_not_be_are_refused_where_they_are_read(tmp_path, name, why):
-    save(tmp_path / "a.png", IDS, {"labels": {"3": name, "184": "tree"}})
-    with pytest.raises(LabelError, match=f"{why}; rename it") as raised:
-        imported(scene_of("a.jpg"), tmp_path)
-    said = str(raised.value)
-    assert said.startswith(f"{tmp_path / 'labels.json'}: label 3 is named ")
-    assert said.isprintable()
-    assert len(said) < 600
-
-
-def test_an_accent_in_two_ways_is_one_name(tmp_path):
-    save(tmp_path / "a.png", IDS, {"labels": {"3": "caf\u00e9", "184": "cafe\u0301"}})
-    with pytest.raises(LabelError, match="name of its own"):
-        imported(scene_of("a.jpg"), tmp_path)
-    save(tmp_path / "a.png", IDS, {"labels": {"3": "cafe\u0301", "184": "Tree"}})
-    assert imported(scene_of("a.jpg"), tmp_path)[0].taxonomy.names == {3: "caf\u00e9", 184: "Tree"}
-
-
-def test_the_longest_names_have_room_for_a_block(tmp_path):
-    names = BlockCategories(Taxonomy({3: "x" * 100}), 300).names
-    names.write(tmp_path / "labels.json")
-    assert Taxonomy.read(tmp_path / "labels.json") == names
-
-
 def test_photos_that_some_disks_take_for_one(tmp_path):
     prepare_folder(tmp_path, scene_of("a.jpg", "sub/a.jpg", "b.jpg").views)
     for one, other in (("a.jpg", "A.png"), ("caf\u00e9.jpg", "cafe\u0301.jpg"), ("a.jpg", "a.png")):
         with pytest.raises(LabelError, match="has the same name but for the suffix or capitals; rename one"):
             prepare_folder(tmp_path, scene_of(one, other).views)
-
-
-def test_a_photo_of_the_longest_name_has_a_label_image(tmp_path):
-    view = scene_of("日" * 83 + ".j").views[0]
-    path = mask_path(tmp_path, view)
-    write_mask(path, WANTED.astype(np.int16), Taxonomy({3: "car", 184: "tree"}))
-    assert len(os.fsencode(path.name)) == 253
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]

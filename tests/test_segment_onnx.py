@@ -9,19 +9,14 @@ import pytest
 from sagesplat.core.errors import BackendUnavailable, LabelError
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Camera, Points, Scene, View
-from sagesplat.segment.masks import Masks, Taxonomy, read_mask
-from sagesplat.segment.onnx import OnnxSegmenter, open_session, read_classes, to_input
-from sagesplat.segment.segmenters import arg_max_resized, segment_views
+from sagesplat.scene.scene import Scene
+from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.onnx import OnnxSegmenter, read_classes, to_input
+from sagesplat.segment.segmenters import arg_max_resized
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 CLASSES = {"classes": ["red", "sky", "other"], "coco_panoptic": {"red": 500, "sky": 187, "other": None}}
 FLOAT, INT64, INT_ATTRIBUTE, INTS_ATTRIBUTE = 1, 7, 2, 7
-
-
-def segment_onnx(scene, photos, model, classes, target, *, threads=1, on_view=None):
-    segmenter = OnnxSegmenter(model, classes, device="cpu", threads=threads)
-    segment_views(scene, photos, segmenter, target, on_view=on_view)
 
 
 def field(number, value):
@@ -82,19 +77,6 @@ def write_model(path, weights, size=(16, 32), channels_first=True, arg_max=False
     return path
 
 
-def scene_of(*names, width=64, height=32):
-    camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), width, height)
-    none = np.zeros(0, np.int64)
-    points = Points(
-        np.zeros((0, 3), np.float32),
-        np.zeros((0, 3), np.uint8),
-        none,
-        none.astype(np.int32),
-        np.zeros((0, 2), np.float32),
-    )
-    return Scene("s", Path(), tuple(View(n, camera, Path(n)) for n in names), points)
-
-
 @pytest.fixture
 def files(tmp_path):
     pytest.importorskip("onnxruntime", reason="needs sagesplat[onnx]")
@@ -134,11 +116,6 @@ def test_classes_of_one_category_are_summed(tmp_path, files):
     np.testing.assert_array_equal(found.label_ids, np.full((8, 16), 187))
 
 
-def test_what_has_no_category_is_unlabelled(files):
-    (found,) = OnnxSegmenter(*files)([np.full((16, 32, 3), (0, 255, 0), np.uint8)])
-    assert (found.label_ids == -1).all()
-
-
 def test_a_model_that_ends_in_an_arg_max(tmp_path, files):
     model = write_model(tmp_path / "m.onnx", np.eye(3)[[0, 2, 1]], arg_max=True)
     (found,) = OnnxSegmenter(model, files[1])([red_and_blue()])
@@ -147,18 +124,6 @@ def test_a_model_that_ends_in_an_arg_max(tmp_path, files):
     write_model(model, [[0, 0, 0], [0, 0, 0], [9, 9, 9]], arg_max=True)
     with pytest.raises(LabelError, match="up to 2, but 2 classes are listed"):
         OnnxSegmenter(model, tmp_path / "c.json")([np.full((32, 64, 3), 255, np.uint8)])
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 2)])
-def test_tiny_photos(files, size):
-    (found,) = OnnxSegmenter(*files)([np.full((*size, 3), (255, 0, 0), np.uint8)])
-    np.testing.assert_array_equal(found.label_ids, np.full(size, 500))
-
-
-def test_a_network_that_overflows(tmp_path, files):
-    model = write_model(tmp_path / "m.onnx", np.full((3, 3), np.inf))
-    with pytest.raises(LabelError, match="not finite"):
-        OnnxSegmenter(model, files[1])([red_and_blue()])
 
 
 def test_classes_of_a_vocabulary(tmp_path):
@@ -171,45 +136,6 @@ def test_classes_of_a_vocabulary(tmp_path):
     path.write_text(json.dumps(content | {"vocabulary": "pascal"}))
     with pytest.raises(LabelError, match="take one of coco, coco-stuff, ade20k, cityscapes"):
         read_classes(path)
-
-
-def test_devices(files):
-    import onnxruntime
-
-    with pytest.raises(BackendUnavailable, match="is not known"):
-        open_session(files[0], 1, "tpu")
-    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
-        pytest.skip("onnxruntime has a GPU here")
-    open_session(files[0], 1, "auto")
-    with pytest.raises(BackendUnavailable, match="finds no CUDA"):
-        open_session(files[0], 1, "cuda:0")
-
-
-def test_a_killed_run_goes_on(tmp_path, files):
-    (model, classes), target = files, tmp_path / "out"
-    scene = scene_of("a.jpg", "sub/b.jpg")
-    photos = [red_and_blue(), red_and_blue()]
-    calls = []
-
-    def killed(done, total):
-        calls.append((done, total))
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        segment_onnx(scene, photos, model, classes, target, threads=1, on_view=killed)
-    assert not (target / "labels.json").exists()
-    photos[0] = np.zeros((32, 64, 3), np.uint8)  # would give another label image, were it looked at again
-    segment_onnx(scene, photos, model, classes, target, threads=1, on_view=lambda *call: calls.append(call))
-    assert calls == [(1, 2), (1, 2), (2, 2)]
-    taxonomy = Taxonomy.read(target / "labels.json")
-    assert taxonomy.names == {187: "sky-other-merged", 500: "red"}
-    for view in scene.views:
-        np.testing.assert_array_equal(Masks(target, taxonomy)[view][:, [0, -1]], [[500, 187]] * 32)
-    smaller = scene_of("a.jpg", "sub/b.jpg", width=32, height=16)
-    segment_onnx(
-        smaller, [red_and_blue(16, 32)] * 2, model, classes, target, threads=1
-    )  # of another size: made anew
-    assert read_mask(target / "a.png", taxonomy).shape == (16, 32)
 
 
 def test_input_and_output_are_resampled_bilinearly(tmp_path):
@@ -231,16 +157,9 @@ def test_input_and_output_are_resampled_bilinearly(tmp_path):
     ("content", "complaint"),
     [
         (None, "no such file"),
-        ([], "not of the form"),
-        ({"classes": ["sky"]}, "not of the form"),
         ({"classes": ["sky"], "coco_panoptic": {}}, "not of the form .*no category of 'sky'"),
-        ({"classes": ["sky"], "coco_panoptic": {"sky": "blue"}}, "not of the form"),
-        ({"classes": ["sky"], "coco_panoptic": {"sky": None}}, "names no label"),
         ({"classes": ["sky"], "coco_panoptic": {"sky": 70000}}, "outside 0"),
         (CLASSES | {"std": 0}, "std: expected float > 0"),
-        (CLASSES | {"mean": [1, 2]}, "not of the form"),
-        ({"classes": [7], "vocabulary": "coco"}, "not of the form"),
-        ({"classes": ["sky"], "vocabulary": "coco", "coco_panoptic": 7}, "not of the form"),
         ({"classes": ["what"], "vocabulary": "coco"}, "names no label"),
     ],
 )
@@ -253,7 +172,7 @@ def test_unusable_classes(tmp_path, content, complaint):
 
 
 def test_unusable_models(tmp_path, files):
-    model, classes = files
+    _, classes = files
     cases = [
         (tmp_path / "none.onnx", "no such file"),
         (classes, "no model that onnxruntime can load"),
@@ -265,10 +184,6 @@ def test_unusable_models(tmp_path, files):
             OnnxSegmenter(path, classes)([red_and_blue()])
         assert "\n" not in str(caught.value)
         assert str(path) in str(caught.value)
-    scene = scene_of("a.jpg")
-    write_model(model, [[0, 0, 0], [0, 0, 0], [9, 9, 9]])
-    with pytest.raises(LabelError, match="every pixel is unlabelled"):
-        segment_onnx(scene, [np.full((32, 64, 3), 255, np.uint8)], model, classes, tmp_path / "out")
 
 
 def attribute(name, number, value, kind):
@@ -288,55 +203,12 @@ LOGITS = ("logits", (1, 3, 16, 32), FLOAT)
 
 
 @pytest.mark.parametrize(
-    ("shape", "kind"),
-    [
-        ((), FLOAT),
-        ((3,), FLOAT),
-        ((1, 3, 16), FLOAT),
-        ((1, 3, 16, 32, 1), FLOAT),
-        ((1, 3, 0, 32), FLOAT),
-        ((1, 3, "height", 32), FLOAT),
-        ((1, 3, 10**9, 10**9), FLOAT),
-        ((1, 3, 2**40, 1), FLOAT),
-        ((1, 3, 16, 32), INT64),
-        ((1, 3, 16, 32), 8),  # strings
-        ((1, 4, 16, 32), FLOAT),
-    ],
-)
-def test_inputs_that_are_no_photo(tmp_path, files, shape, kind):
-    nodes = node("Identity", ["photo"], "logits")
-    model = model_of(tmp_path / "m.onnx", nodes, [("photo", shape, kind)], [("logits", shape, kind)])
-    with pytest.raises(LabelError, match=r"m\.onnx: .*export it") as caught:
-        OnnxSegmenter(model, files[1])
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 1000
-
-
-def test_models_without_inputs_or_with_two(tmp_path, files):
-    one = field(5, field(1, 1) + field(2, FLOAT) + field(8, "one") + field(9, struct.pack("<f", 1)))
-    two = [("photo", (1, 3, 16, 32), FLOAT), ("other", (1, 3, 16, 32), FLOAT)]
-    cases = [
-        ("0 inputs", node("Identity", ["one"], "logits"), (), [("logits", (1,), FLOAT)], one),
-        ("2 inputs", node("Add", ["photo", "other"], "logits"), two, [LOGITS], b""),
-    ]
-    for complaint, nodes, inputs, outputs, tensors in cases:
-        model = model_of(tmp_path / "m.onnx", nodes, inputs, outputs, tensors)
-        with pytest.raises(LabelError, match=complaint):
-            OnnxSegmenter(model, files[1])
-
-
-@pytest.mark.parametrize(
     ("nodes", "output"),
     [
         (b"", None),
         (node("Flatten", ["photo"], "logits"), ("logits", (1, 1536), FLOAT)),
-        (node("ReduceMax", ["photo"], "logits"), ("logits", (1, 1, 1, 1), FLOAT)),
-        (node("Shape", ["photo"], "logits"), ("logits", (4,), INT64)),
-        (node("Size", ["photo"], "logits"), ("logits", (), INT64)),
-        (node("IsNaN", ["photo"], "logits"), ("logits", (1, 3, 16, 32), 9)),  # of truth values
         (node("Transpose", ["photo"], "logits", perm=(2, 1, 0, 3)), ("logits", (16, 3, 1, 32), FLOAT)),
         (node("Sqrt", ["photo"], "logits"), LOGITS),  # NaN
-        (node("Unheard", ["photo"], "logits"), LOGITS),  # an operator of somebody's own
     ],
 )
 def test_outputs_that_are_no_label_scores(tmp_path, files, nodes, output):
@@ -373,7 +245,7 @@ def test_a_loop_that_never_ends_is_stopped(tmp_path, files, capfd):
     assert OnnxSegmenter(*files, time_limit=600)([red_and_blue()])  # one that ends
 
 
-@pytest.mark.parametrize("location", ["../w.bin", "/etc/passwd", "link.bin", "w.bin"])
+@pytest.mark.parametrize("location", ["../w.bin", "link.bin", "w.bin"])
 def test_weights_outside_of_the_models_folder_are_not_read(tmp_path, files, location):
     folder = tmp_path / "model"
     folder.mkdir()

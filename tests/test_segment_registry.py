@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sagesplat.core.config import MasksConfig, SceneConfig
-from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json
@@ -36,19 +35,6 @@ def test_the_command_line_offers_every_segmenter() -> None:
 )  # fmt: skip
 def test_the_suffix_of_a_model_tells_its_segmenter(model: str | None, kind: str) -> None:
     assert segmenter_for(model) == kind
-
-
-@pytest.mark.parametrize(
-    ("kind", "config", "message"),
-    [
-        ("onnx", MasksConfig(), "--segmenter onnx needs --model"),
-        ("onnx", MasksConfig(model=__file__), "--segmenter onnx needs --model .* and --classes"),
-        ("deeplabv2", MasksConfig(model="no.pth"), "no.pth: no such file; --segmenter deeplabv2 needs"),
-    ],
-)
-def test_missing_files_are_named(kind: str, config: MasksConfig, message: str) -> None:
-    with pytest.raises(RunError, match=message):
-        SEGMENTERS[kind].settings(config)
 
 
 class Threshold:

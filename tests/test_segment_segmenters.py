@@ -1,24 +1,23 @@
-import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import test_segment_masks as masks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from sagesplat.core.errors import BackendUnavailable, LabelError, SceneError
+from sagesplat.core.errors import SceneError
 from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Camera, Points, Scene, View
+from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.segmenters import (
     Segmented,
-    Segmenter,
     arg_max_resized,
     group_classes,
-    parse_device,
     segment_views,
 )
 
@@ -43,15 +42,7 @@ class Bright:
 def scene_of(sizes: dict[str, tuple[int, int]], path: Path = Path("scene")) -> Scene:
     eye4, eye3 = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
     views = tuple(View(name, Camera(eye4, eye3, w, h), path / name) for name, (h, w) in sizes.items())
-    none = np.zeros(0, np.int64)
-    points = Points(
-        np.zeros((0, 3), np.float32),
-        np.zeros((0, 3), np.uint8),
-        none,
-        none.astype(np.int32),
-        np.zeros((0, 2), np.float32),
-    )
-    return Scene("s", path, views, points)
+    return replace(masks.scene_of(), views=views, path=path)
 
 
 def half_bright(height: int, width: int) -> np.ndarray:
@@ -110,17 +101,11 @@ def interrupt(done: int, total: int) -> None:
 
 
 def test_unusable_scenes(tmp_path: Path) -> None:
-    segmenter: Segmenter = Bright()
-    with pytest.raises(LabelError, match="a scene without views"):
-        segment_views(scene_of({}), [], segmenter, tmp_path / "out")
-    same = scene_of({"a.jpg": (16, 32), "a.png": (16, 32)})
-    with pytest.raises(LabelError, match="the same name but for the suffix"):
-        segment_views(same, PHOTOS, segmenter, tmp_path / "out")
     scene = scene_of({"a.png": (16, 32), "b.png": (16, 32)}, tmp_path)
     Image.new("L", (32, 16), 200).save(tmp_path / "a.png")  # grey
     (tmp_path / "b.png").write_bytes(b"damaged")
     with pytest.raises(SceneError, match=r"b\.png: not readable"):
-        segment_views(scene, Photos(scene.views), segmenter, tmp_path / "out")
+        segment_views(scene, Photos(scene.views), Bright(), tmp_path / "out")
     assert (tmp_path / "out" / "a.png").exists()
 
 
@@ -133,23 +118,7 @@ def test_groups_and_the_largest_logit() -> None:
     assert found.tolist() == [[-1, TREE, TREE, TREE]] * 2  # 0.4 to 0.6 a quarter of the way
 
 
-def test_names_of_devices() -> None:
-    assert parse_device("auto") == ("auto", 0)
-    assert parse_device("cpu") == ("cpu", 0)
-    assert parse_device("cuda") == ("cuda", 0)
-    assert parse_device("cuda:12") == ("cuda", 12)
-    for wrong in ("", "gpu", "cuda:", "cuda:-1", "cuda:1 ", "CPU"):
-        with pytest.raises(BackendUnavailable, match="is not known"):
-            parse_device(wrong)
-
-
-def test_the_marker_is_plain(tmp_path: Path) -> None:
-    segment_views(scene_of({"a.jpg": (16, 32)}), PHOTOS[:1], Bright(), tmp_path)
-    marker = json.loads((tmp_path / ".taxonomy.json").read_text())
-    assert marker == {"184": "tree-merged", "187": "sky-other-merged"}
-
-
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     hnp.arrays(
         np.float32, hnp.array_shapes(min_dims=3, max_dims=3, max_side=6), elements=st.floats(-9, 9, width=32)

@@ -66,8 +66,6 @@ def test_a_view_without_a_pixel_and_a_scene_without_one(tmp_path, scene):
     assert ValidPixels(tmp_path / "valid").rows(one, range(4)) == [1, 2, 3]
     with pytest.raises(LabelError, match="no pixel of any training photo counts"):
         write_valid(scene, tmp_path / "valid", label_ids=masks, ignore=[PERSON, TREE])
-    with pytest.raises(LabelError, match=r"--labels\.ignore-dilation -1"):
-        write_valid(scene, tmp_path / "valid", dilation=-1)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA", "LA", "I;16"])
@@ -138,10 +136,6 @@ def test_transparent_borders_are_of_cut_out_objects(tmp_path, scene):
     assert not ignores_alpha(scene)
     assert write_valid(scene, tmp_path / "valid").sum() == 0
     assert ignores_alpha(replace(scene, alpha="ignore"))
-
-
-def test_opaque_photos_have_no_alpha_to_ignore(scene):
-    assert not ignores_alpha(scene)
 
 
 def test_black_is_zero_in_every_channel(tmp_path):

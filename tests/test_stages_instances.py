@@ -14,8 +14,9 @@ from sagesplat.core.events import StageDone, StageSkipped, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.segment.instances import instance_path, read_instances, write_instances
+from sagesplat.segment.instances import read_instances, write_instances
 from sagesplat.segment.lift import LiftedLabels
+from sagesplat.segment.masks import mask_path
 from sagesplat.stages.instances import make_instances
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
@@ -96,7 +97,7 @@ def test_what_cannot_be_told_apart_is_one_line_with_a_cure(run: Path, trained: P
     shutil.copytree(given.parent / "masks", run.parent / "few" / "masks")
     shutil.copytree(given, run.parent / "few" / "instances")
     for view in job.scene.views:
-        path = instance_path(run.parent / "few" / "instances", view)
+        path = mask_path(run.parent / "few" / "instances", view)
         numbers = np.where(job.masks[view] == VASE, -1, read_instances(path))
         if view != one:
             write_instances(path, numbers)
@@ -107,7 +108,7 @@ def test_what_cannot_be_told_apart_is_one_line_with_a_cure(run: Path, trained: P
     assert said == ["1 instance of vase in a single photo is left to vase: no other view agrees"]
     for view in job.scene.views:
         if view != one:
-            instance_path(run.parent / "few" / "instances", view).unlink()
+            mask_path(run.parent / "few" / "instances", view).unlink()
     with pytest.raises(RunError, match=r"instances of 1 of \d+ training photos; give those of two at least"):
         make_instances(job_on(run, [], force=True), source, PLANTS)
     job = job_on(run, [], force=True)

@@ -5,25 +5,51 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int16, UInt8
 from PIL import Image
 
 from sagesplat import __version__
 from sagesplat.core.errors import SceneError
 from sagesplat.demo.cameras import demo_cameras, grid_cameras
-from sagesplat.demo.figures import PERSON
+from sagesplat.demo.figures import PERSON, figures_at
 from sagesplat.demo.foliage import NO_OBJECT
-from sagesplat.demo.objects import render_objects
 from sagesplat.demo.off_path import off_path_pictures, write_pictures, write_transforms
 from sagesplat.demo.points import Taken, write_points
-from sagesplat.demo.render import lit_world, threads_map
-from sagesplat.demo.shots import Shot, take_shot
-from sagesplat.demo.wild import FACING, NOTHING, Wild, camera_gains, kept_views, noisy_cameras
-from sagesplat.demo.world import LABELS
+from sagesplat.demo.render import (
+    FAR,
+    camera_rays,
+    cast_rays,
+    lit_world,
+    render_light,
+    take_photo,
+    threads_map,
+)
+from sagesplat.demo.wild import (
+    FACING,
+    NOTHING,
+    Wild,
+    camera_gains,
+    kept_views,
+    lens_falloff,
+    noisy_cameras,
+)
+from sagesplat.demo.world import BRICK, CORE, LABELS, LEAF, ROOF, WOOD
 from sagesplat.io.files import cache_folder, unwritable, write_json
 from sagesplat.scene.scene import Camera
+
+
+class Shot(NamedTuple):
+    """A photo with its truth; without disturbances both are the same arrays."""
+
+    photo: UInt8[np.ndarray, "H W 3"]
+    label: UInt8[np.ndarray, "H W"]  # with the figures, where label images show them
+    hidden: Bool[np.ndarray, "H W"]  # where a figure stands
+    true_photo: UInt8[np.ndarray, "H W 3"]
+    true_label: UInt8[np.ndarray, "H W"]
+    depth: Float32[np.ndarray, "H W"]  # of the scene without figures
 
 
 def make_capture(
@@ -149,7 +175,7 @@ def _write(
     lit_world(seed, places)  # cached here, before threads use it
 
     def take(i: int) -> Shot:
-        return take_shot(cameras[i], rows[i], seed, places, wild, gains[rows[i]])
+        return _take_shot(cameras[i], rows[i], seed, places, wild, gains[rows[i]])
 
     shots = []
     for i, shot in enumerate(threads_map(take, range(len(cameras)))):
@@ -171,14 +197,57 @@ def _write(
     write_points(folder / "sparse" / "0", names, cameras, photos, labels, seed, places, taken)
 
 
+def _take_shot(
+    camera: Camera,
+    number: int,
+    seed: int,
+    places: tuple[int, int],
+    wild: Wild,
+    gains: Float64[np.ndarray, "3"],
+) -> Shot:
+    """The photo of this number on the path; `gains` are its factors of linear RGB.
+
+    Light is disturbed before the tone curve, as in a camera, and the sensor's noise is that of the
+    undisturbed photo.
+    """
+    light, true_label, depth = render_light(camera, seed, places)
+    true_photo, true_label = take_photo(light, camera, seed), true_label.astype(np.uint8)
+    label = true_label
+    hidden = np.zeros(label.shape, bool)
+    if wild.quiet:
+        return Shot(true_photo, label, hidden, true_photo, true_label, depth)
+    if wild.figures:
+        figures = figures_at(number, camera.position, wild.figures, seed)
+        light, with_figures, _ = render_light(camera, seed, places, figures)
+        hidden = with_figures == PERSON
+        label = with_figures.astype(np.uint8) if wild.figure_masks else true_label
+    photo = take_photo(light * gains * lens_falloff(wild, camera), camera, seed)
+    return Shot(photo, label, hidden, true_photo, true_label, depth)
+
+
 def _write_objects(
     folder: Path, names: list[str], cameras: list[Camera], shots: list[Shot], seed: int
 ) -> None:
     """Number of the object at each pixel, in the photos as they were taken: none where a figure stands."""
     folder.mkdir()
     for name, camera, shot in zip(names, cameras, shots, strict=True):
-        objects = np.where(shot.hidden, NO_OBJECT, render_objects(camera, seed)[0])
+        objects = np.where(shot.hidden, NO_OBJECT, _render_objects(camera, seed))
         Image.fromarray(objects.astype(np.uint16)).save(folder / name)
+
+
+def _render_objects(camera: Camera, seed: int) -> Int16[np.ndarray, "H W"]:
+    """The object of `build_world` at each pixel's centre, NO_OBJECT where there is none."""
+    world = lit_world(seed)
+    v, u = (np.indices((camera.height, camera.width)) + 0.5).reshape(2, -1)
+    origins, directions, _ = camera_rays(camera, np.stack([u, v], 1))
+    _, material, part = cast_rays(world, origins, directions, FAR, float(1 / camera.K[0, 0]))
+    found = np.full(len(part), NO_OBJECT, np.int16)
+    bodies, leaves = np.isin(material, (BRICK, ROOF, CORE)), material == LEAF
+    solids = (material >= WOOD) & ~bodies & ~leaves
+    found[leaves] = world.leaf_object[part[leaves]]
+    found[bodies] = world.body_object[part[bodies] // 8]
+    found[solids] = world.solid_object[part[solids]]
+    return found.reshape(camera.height, camera.width)
 
 
 def _write_truth(

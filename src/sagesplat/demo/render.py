@@ -42,14 +42,14 @@ def _lit_world(seed: int, places: tuple[int, int]) -> World:
 
 
 def render_view(
-    camera: Camera, seed: int = 0, places: tuple[int, int] = (1, 1)
+    camera: Camera, seed: int = 0
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
     """A photo (sRGB) with its ground-truth label ids and depths (camera z in metres, inf in the sky).
 
     Label and depth are those of the ray through the pixel's centre. The clouds are on a dome of 80 m radius.
     The sensor noise depends on seed and pose, so a view always gives the same photo.
     """
-    light, label, depth = render_light(camera, seed, places)
+    light, label, depth = render_light(camera, seed)
     return take_photo(light, camera, seed), label, depth
 
 

@@ -52,10 +52,6 @@ class Wild:
 
 
 NOTHING = Wild()
-EXPOSURE = Wild(exposure=0.7, white_balance=0.15)
-VIGNETTING = Wild(vignetting=0.4)
-FIGURES = Wild(figures=3)
-POSES = Wild(pose_degrees=0.5, pose_shift=0.005)
 EVERYTHING = Wild(0.7, 0.15, 0.4, 3, True, 0.5, 0.005, off_path=40)  # what `sagesplat demo --wild` draws
 
 

@@ -42,10 +42,10 @@ class RemoteScene:
 Registry = Mapping[str, RemoteScene]
 
 
-def read_registry(path: Path = REGISTRY) -> dict[str, RemoteScene]:
-    """The scenes of a registry file by name; scenes.toml documents the format."""
+def read_registry() -> dict[str, RemoteScene]:
+    """The scenes of scenes.toml, which documents its format, by name."""
     scenes = {}
-    for collection, shared in tomllib.loads(path.read_text(encoding="utf-8")).items():
+    for collection, shared in tomllib.loads(REGISTRY.read_text(encoding="utf-8")).items():
         for archive in shared["archives"]:
             for scene in archive["scenes"]:
                 name = f"{collection}/{scene['name']}"

@@ -14,11 +14,11 @@ from sagesplat.core.names import cleaned, clipped, collision_key
 from sagesplat.io.files import atomic_path, link
 from sagesplat.io.pictures import PictureError, open_picture
 from sagesplat.scene.detect import PHOTOS, VALID_FOLDER
+from sagesplat.scene.exif import DETAILS, exif_of
 from sagesplat.scene.images import as_rgb
 
 _LONGEST, _ROOM = 250, 30  # bytes of a name, and what is left of them for suffixes
-_ORIENTATION, _MAKER, _MODEL, _DETAILS, _FOCAL, _FOCAL_35 = 0x0112, 0x010F, 0x0110, 0x8769, 0x920A, 0xA405
-_LARGEST_EXIF = 2**20  # bytes
+_ORIENTATION, _MAKER, _MODEL, _FOCAL, _FOCAL_35 = 0x0112, 0x010F, 0x0110, 0x920A, 0xA405
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def _prepare_photo(path: Path, folder: Path, key: str) -> tuple[Path, tuple[Any,
     """
     changed = None
     with open_picture(path) as image:
-        stat, exif = path.stat(), _exif(image)
+        stat, exif = path.stat(), exif_of(image)
         target = folder / (key + (".png" if image.format in ("PNG", "TIFF", "BMP") else ".jpg"))
         camera = _camera(image.size, exif)
         done = _is_prepared(target, camera[:2], stat.st_mtime_ns)
@@ -149,18 +149,6 @@ def _is_prepared(target: Path, size: tuple[int, ...], mtime_ns: int) -> bool:
         return False
 
 
-def _exif(image: Image.Image) -> Image.Exif:
-    """The photo's EXIF; empty if it is damaged, or larger than photos have it."""
-    if len(image.info.get("exif") or b"") > _LARGEST_EXIF:
-        return Image.Exif()
-    try:
-        exif = image.getexif()
-        exif.get_ifd(_DETAILS)
-        return exif
-    except Exception:  # Pillow raises errors of many kinds here too
-        return Image.Exif()
-
-
 def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | None:
     """The photo as upright 8-bit RGB, or None if the file is that already; decodes it in both cases."""
     turned = _orientation(exif) > 1
@@ -177,9 +165,9 @@ def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | 
 
 def _save(image: Image.Image, exif: Image.Exif, path: Path) -> None:
     """Write a photo with the EXIF tags from which COLMAP derives the focal length."""
-    kept, details = Image.Exif(), exif.get_ifd(_DETAILS)
+    kept, details = Image.Exif(), exif.get_ifd(DETAILS)
     kept.update({tag: exif[tag] for tag in (_MAKER, _MODEL) if tag in exif})
-    kept.get_ifd(_DETAILS).update({tag: details[tag] for tag in (_FOCAL, _FOCAL_35) if tag in details})
+    kept.get_ifd(DETAILS).update({tag: details[tag] for tag in (_FOCAL, _FOCAL_35) if tag in details})
     try:
         content = kept.tobytes()
     except Exception:  # values that Pillow reads but cannot write
@@ -196,7 +184,7 @@ def _orientation(exif: Image.Exif) -> int:
 
 def _camera(size: tuple[int, int], exif: Image.Exif) -> tuple[Any, ...]:
     """Key of photos with one camera and zoom: upright size, maker, model, focal lengths."""
-    details = exif.get_ifd(_DETAILS)
+    details = exif.get_ifd(DETAILS)
     focal = [details.get(tag, "") for tag in (_FOCAL, _FOCAL_35)]  # in mm, and 35 mm equivalent
     upright = size[::-1] if _orientation(exif) >= 5 else size
     return (*upright, *(str(value)[:200] for value in (exif.get(_MAKER, ""), exif.get(_MODEL, ""), *focal)))

@@ -1,5 +1,6 @@
 """Loads COLMAP workspaces: a folder of photos and a sparse model."""
 
+import os.path
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,18 +12,17 @@ from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
 from sagesplat.scene.loading import MIN_VIEWS, camera_of, check_settings
 from sagesplat.scene.scene import Lens, Points, Scene, View
-from sagesplat.scene.undistort import distort, intrinsics, is_pinhole, pinhole
+from sagesplat.scene.undistort import distort, is_pinhole, pinhole
 
 MODEL_FILES = ("sparse/0/cameras.bin", "sparse/0/cameras.txt", "sparse/cameras.bin", "sparse/cameras.txt")
 
 
-def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8, images: str | None = None) -> Scene:
+def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
     """The scene of a COLMAP workspace: `images/` and `sparse/0` (or `sparse`) below `path`.
 
     With `downscale` N the photos are read from `images_N/` if that folder exists. Otherwise they are read
-    from `images/` and area-resampled. `images` names another folder below `path`. Distorted cameras are
-    replaced by pinholes (`undistort.pinhole`), and their observations are undistorted. Observations outside
-    the image are dropped. Raises SceneError.
+    from `images/` and area-resampled. Distorted cameras are replaced by pinholes (`undistort.pinhole`), and
+    their observations are undistorted. Observations outside the image are dropped. Raises SceneError.
     """
     check_settings(path, downscale, test_every)
     model = _find_model(path)
@@ -36,7 +36,7 @@ def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8, images: 
             raise SceneError(f"{model}: no 3D points; run COLMAP's mapper or point_triangulator again")
         _check_names(model, listed)
         listed = sorted(listed, key=lambda image: image.name)
-        folder, divisor = _find_photos(path, images, downscale)
+        folder, divisor = _find_photos(path, downscale)
         _check_photos(folder, listed)
         views = _views(model, folder, cameras, listed, divisor)
         tracked = _scene_points(cameras, listed, views, points)
@@ -55,11 +55,11 @@ def _find_model(path: Path) -> Path:
     )
 
 
-def _find_photos(path: Path, images: str | None, downscale: int) -> tuple[Path, int]:
+def _find_photos(path: Path, downscale: int) -> tuple[Path, int]:
     """The folder of the photos, and the factor by which they are still to be downscaled."""
-    if images is None and downscale > 1 and (path / f"images_{downscale}").is_dir():
+    if downscale > 1 and (path / f"images_{downscale}").is_dir():
         return path / f"images_{downscale}", 1
-    folder = path / (images or "images")
+    folder = path / "images"
     if not folder.is_dir():
         raise SceneError(f"{folder}: no such folder; put the photos that COLMAP was run on there")
     return folder, downscale
@@ -76,7 +76,7 @@ def _check_names(model: Path, listed: Sequence[ModelImage]) -> None:
 
 
 def _check_photos(folder: Path, listed: Sequence[ModelImage]) -> None:
-    missing = [i.name for i in listed if not _is_file(folder / i.name)]
+    missing = [i.name for i in listed if not os.path.isfile(folder / i.name)]
     if missing:
         raise SceneError(
             f"{folder}: {len(missing)} of the model's {len(listed)} photos are missing, "
@@ -86,13 +86,6 @@ def _check_photos(folder: Path, listed: Sequence[ModelImage]) -> None:
     names = {i.name for i in listed}
     if len(names) < len(listed):
         raise SceneError(f"{folder}: the model lists a photo twice; run COLMAP's mapper again")
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a damaged name, e.g. too long
-        return False
 
 
 def _views(
@@ -107,7 +100,7 @@ def _views(
         c = cameras[id]
         lenses[id] = Lens(c.model, c.params, c.width, c.height)
         try:
-            Ks[id] = intrinsics(lenses[id]) if is_pinhole(lenses[id]) else pinhole(lenses[id])
+            Ks[id] = pinhole(lenses[id])
         except ValueError as error:
             raise SceneError(f"{model}: camera {id}: {error}; calibrate it again with COLMAP") from None
     views = []

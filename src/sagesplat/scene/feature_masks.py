@@ -14,7 +14,7 @@ from sagesplat.io.files import atomic_path
 from sagesplat.scene._prepare import PreparedPhoto
 from sagesplat.scene.detect import VALID_FOLDER
 from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
-from sagesplat.scene.raw_photos import oriented
+from sagesplat.scene.raw_photos import same_aspect, upright
 
 Pixels = Bool[np.ndarray, "H W"]
 OfPhoto = Callable[[str], Pixels | None]  # name of a photo -> its pixels that count, at any resolution
@@ -48,7 +48,7 @@ def write_feature_masks(
     for photo in photos:
         given = [_of_folder(photo, source / VALID_FOLDER)]
         if photo in opaque_only:
-            given.append(oriented(load_alpha(source / photo.path) == 255, photo.orientation))
+            given.append(upright(load_alpha(source / photo.path) == 255, photo.orientation))
         if (valid := _all_of(photo, given)) is not None:
             _write(capture / VALID_FOLDER / Path(photo.final).with_suffix(".png"), valid)
         valid = _all_of(photo, [valid, ignored(photo.final)])
@@ -75,21 +75,16 @@ def _of_folder(photo: PreparedPhoto, folder: Path) -> Pixels | None:
 def _upright(mask: Bool[np.ndarray, "h w"], photo: PreparedPhoto) -> Pixels:
     """A mask of a photo at its size, looked at as the photo is."""
     width, height = photo.size
-    if photo.orientation >= 5 and _alike(mask, (height, width)) and not _alike(mask, (width, height)):
-        mask = oriented(mask, photo.orientation)
-    if not _alike(mask, (width, height)):
+    fits, fits_turned = (same_aspect(mask.shape[::-1], size) for size in ((width, height), (height, width)))
+    if photo.orientation >= 5 and fits_turned and not fits:
+        mask, fits = upright(mask, photo.orientation), True
+    if not fits:
         h, w = mask.shape
         raise SceneError(
             f"{photo.path}: a mask or label image of {w} x {h} pixels, but the photo has {width} x {height}; "
             "they show the whole photo, at any resolution"
         )
     return np.asarray(Image.fromarray(mask).resize((width, height), Image.Resampling.NEAREST))
-
-
-def _alike(image: Pixels, size: tuple[int, int]) -> bool:
-    """Whether an image has an aspect ratio: the smaller one may be rounded to whole pixels, by up to one."""
-    height, width = image.shape
-    return abs(width * size[1] - height * size[0]) <= max(width, height, *size)
 
 
 def _all_of(photo: PreparedPhoto, masks: Sequence[Pixels | None]) -> Pixels | None:

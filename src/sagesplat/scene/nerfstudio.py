@@ -5,6 +5,7 @@ and the synthetic scenes of Mildenhall et al. 2020. Poses are camera-to-world wi
 z back). The world frame is the file's: it is not rotated, moved or scaled.
 """
 
+import os.path
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
@@ -23,7 +24,7 @@ from sagesplat.scene.images import has_alpha, photo_size
 from sagesplat.scene.loading import MAX_SIDE, MIN_VIEWS, camera_of, check_settings
 from sagesplat.scene.points import random_points, read_points
 from sagesplat.scene.scene import Camera, Lens, Scene, View
-from sagesplat.scene.undistort import intrinsics, is_pinhole, pinhole
+from sagesplat.scene.undistort import is_pinhole, pinhole
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
@@ -149,7 +150,6 @@ def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
     """
     _, frames = _read(file)
     found, photos = [], []
-    pinholes: dict[tuple, np.ndarray] = {}  # computing one takes milliseconds
     for number, frame in enumerate(frames):
         name = frame.file_path or f"{number:03}"
         try:
@@ -158,14 +158,12 @@ def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
             if photos[-1] is None and (frame.w is None or frame.h is None):
                 raise ValueError("neither w and h nor its photo")
             lens = _lens(frame, photos[-1] or file)
-            key = (lens.model, lens.params, lens.width, lens.height)
-            if key not in pinholes:
-                pinholes[key] = intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
+            K = pinhole(lens).astype(np.float32)
             w2c = frame.world_to_camera().astype(np.float32)
         except ValueError as error:
             cure = "export the transforms again"
             raise SceneError(f"{file}: frame {short(repr(name))}: {short(error)}; {cure}") from None
-        found.append((name, Camera(w2c, pinholes[key].astype(np.float32), lens.width, lens.height)))
+        found.append((name, Camera(w2c, K, lens.width, lens.height)))
     return found, None not in photos
 
 
@@ -218,22 +216,18 @@ def _views(file: Path, frames: Sequence[_Frame], downscale: int) -> list[View]:
             f"{root}: {len(missing)} of the {len(paths)} photos of {file.name} are missing, first "
             f"{short(repr(str(missing[0])))}; add the files, or remove their frames"
         )
-    lenses: dict[tuple, tuple[Lens, np.ndarray]] = {}  # computing a pinhole takes milliseconds
     views = []
     for frame, path, photo in zip(frames, paths, photos, strict=True):
         assert photo is not None
         try:
             original = (_photo(folder, path) or photo) if shipped else photo
             lens = _lens(frame, original)
-            key = (lens.model, lens.params, lens.width, lens.height)
-            if key not in lenses:
-                lenses[key] = lens, intrinsics(lens) if is_pinhole(lens) else pinhole(lens)
+            K = pinhole(lens)
             w2c = frame.world_to_camera()
             valid = _mask(file, frame)
         except ValueError as error:
             reason = short(error)
             raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
-        lens, K = lenses[key]
         camera = camera_of(photo, w2c, lens, K, divisor)
         name = photo.relative_to(root).as_posix()
         views.append(View(name, camera, photo, None if is_pinhole(lens) else lens, valid))
@@ -252,14 +246,8 @@ def _mask(file: Path, frame: _Frame) -> Path | None:
 
 def _photo(root: Path, path: PurePosixPath) -> Path | None:
     """A frame's file; Blender scenes leave its suffix out of the file_path."""
-    for name in (path.name, *(path.name + suffix for suffix in SUFFIXES)):
-        photo = root / path.parent / name
-        try:
-            if photo.is_file():
-                return photo
-        except OSError:  # a damaged name, e.g. too long
-            return None
-    return None
+    photos = (root / path.parent / f"{path.name}{suffix}" for suffix in ("", *SUFFIXES))
+    return next((photo for photo in photos if os.path.isfile(photo)), None)  # False for impossible names
 
 
 def _lens(frame: _Frame, photo: Path) -> Lens:

@@ -92,7 +92,17 @@ def reconstruct(
     write_json(work / "request.json", request | {"min_photos": least, "threads": threads})
     seconds = {"prepare": round(time.perf_counter() - started, 2)}
     result = _run(work, on_progress)
-    reconstruction = _reconstruction(workspace, photos, unreadable, seconds, result)
+    names = {photo.prepared: photo.name for photo in photos}
+    reasons = {names[prepared]: reason for prepared, reason in result["reasons"].items()}
+    reconstruction = Reconstruction(
+        workspace=workspace,
+        num_photos=len(photos),
+        num_registered=len(result["registered"]),
+        unregistered=reasons | unreadable,
+        num_points=result["num_points"],
+        reprojection_error=result["reprojection_error"],
+        seconds=seconds | result["seconds"],
+    )
     complete = reconstruction.num_registered >= least
     if complete:
         _publish(workspace)
@@ -112,27 +122,6 @@ def reconstruct(
             f"another camera, a larger max_size; reasons in {workspace / 'poses.json'}"
         )
     return reconstruction
-
-
-def _reconstruction(
-    workspace: Path,
-    photos: list[PreparedPhoto],
-    unreadable: dict[str, str],
-    seconds: dict[str, float],
-    result: dict[str, Any],
-) -> Reconstruction:
-    """The result of _sfm.py, with the photos under their own names."""
-    names = {photo.prepared: photo.name for photo in photos}
-    reasons = {names[prepared]: reason for prepared, reason in result["reasons"].items()}
-    return Reconstruction(
-        workspace=workspace,
-        num_photos=len(photos),
-        num_registered=len(result["registered"]),
-        unregistered=reasons | unreadable,
-        num_points=result["num_points"],
-        reprojection_error=result["reprojection_error"],
-        seconds=seconds | result["seconds"],
-    )
 
 
 def _check(source: Path, workspace: Path, config: PosesConfig) -> None:

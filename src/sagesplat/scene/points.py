@@ -80,9 +80,7 @@ def _read_vertices(path: Path, file: BinaryIO, header: PlyHeader) -> dict[str, n
     return {name: table[name] for name in types}
 
 
-def random_points(
-    views: Sequence[View], count: int = 100_000, *, seed: int = 0, cube: float | None = None
-) -> Points:
+def random_points(views: Sequence[View], count: int = 100_000, *, cube: float | None = None) -> Points:
     """`count` random initial points, without tracks.
 
     With `cube` they are uniform in [-cube, cube]^3, as 3DGS initialises NeRF's Blender scenes. Otherwise they
@@ -94,13 +92,14 @@ def random_points(
 
     A point's colour is the mean over some photos at its projections. Raises SceneError.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     with np.errstate(all="ignore"):  # cameras may be anywhere; points that overflow are in no view
         if cube is None:
             xyz = _in_sight(views, count, rng)
         else:
             xyz = rng.uniform(-cube, cube, (count, 3)).astype(np.float32)
-        return untracked(xyz, _mean_colours(xyz, _spread(views, COLOUR_VIEWS)))
+        some = np.linspace(0, len(views) - 1, min(COLOUR_VIEWS, len(views))).round().astype(int)
+        return untracked(xyz, _mean_colours(xyz, [views[row] for row in np.unique(some)]))
 
 
 def focus(views: Sequence[View]) -> tuple[Float64[np.ndarray, "3"], float]:
@@ -188,9 +187,3 @@ def _inside(
     uv, _ = geometry.project(xyz, camera.w2c, camera.K)
     inside = np.all((uv >= 0) & (uv < [camera.width, camera.height]), axis=1)
     return inside, np.where(inside[:, None], uv, 0).astype(np.int64)
-
-
-def _spread(views: Sequence[View], count: int) -> list[View]:
-    """At most `count` of the views, evenly spaced in their order."""
-    rows = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))
-    return [views[row] for row in rows]

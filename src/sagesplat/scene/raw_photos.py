@@ -36,16 +36,18 @@ class RawPhoto:
         return self.orientation in _SIDEWAYS
 
 
-def oriented(image: Shaped[np.ndarray, "h w"], orientation: int) -> Shaped[np.ndarray, "H W"]:
-    """An image of stored pixels as EXIF says that it is to be looked at; `orientation` is 1 ... 8."""
-    if orientation >= 5:
-        return upright(image, orientation)
-    return {1: image, 2: image[:, ::-1], 3: image[::-1, ::-1], 4: image[::-1]}[orientation]
-
-
 def upright(image: Shaped[np.ndarray, "h w"], orientation: int) -> Shaped[np.ndarray, "H W"]:
-    """An image of stored pixels as EXIF says that it is to be looked at; `orientation` is 5 ... 8."""
-    return {5: image.T, 6: np.rot90(image, -1), 7: np.rot90(image, 2).T, 8: np.rot90(image)}[orientation]
+    """An image of stored pixels as EXIF says that it is to be looked at; `orientation` is 1 ... 8."""
+    views = (
+        *(image, image[:, ::-1], image[::-1, ::-1], image[::-1]),
+        *(image.T, np.rot90(image, -1), np.rot90(image, 2).T, np.rot90(image)),
+    )
+    return views[orientation - 1]
+
+
+def same_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether aspect ratios are equal: the smaller picture may be rounded to whole pixels, by up to one."""
+    return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 
 def describe_raw(model: Path, names: Mapping[str, tuple[str, int]]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32
 from sagesplat.core.errors import RunError, short
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
-from sagesplat.scene.scene import Camera, Scene
+from sagesplat.scene.scene import Scene
 
 _FORMAT = 1
 _MAX_SHEAR = 1e-3  # largest entry of R R^T - I
@@ -36,16 +36,12 @@ def with_cameras(scene: Scene, cameras: RefinedCameras) -> Scene:
     """The scene with refined cameras; ValueError where they are of another number of views."""
     if len(cameras.w2c) != len(scene.views):
         raise ValueError(f"{len(cameras.w2c)} cameras for {len(scene.views)} views")
-    views = [
-        replace(view, camera=_with(view.camera, w2c, exposure))
-        for view, w2c, exposure in zip(scene.views, cameras.w2c, cameras.exposure, strict=True)
-    ]
+    views = []
+    for view, w2c, exposure in zip(scene.views, cameras.w2c, cameras.exposure, strict=True):
+        neutral = (exposure == np.eye(3, 4)).all()
+        camera = replace(view.camera, w2c=w2c, exposure=None if neutral else exposure)
+        views.append(replace(view, camera=camera))
     return replace(scene, views=tuple(views))
-
-
-def _with(camera: Camera, w2c: Float32[np.ndarray, "4 4"], exposure: Float32[np.ndarray, "3 4"]) -> Camera:
-    neutral = (exposure == np.eye(3, 4)).all()
-    return replace(camera, w2c=w2c, exposure=None if neutral else exposure)
 
 
 def write_refined(path: Path, cameras: RefinedCameras) -> None:

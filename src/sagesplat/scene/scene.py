@@ -50,7 +50,7 @@ class Camera:
         return self.resized(max(1, round(self.width * share)), max(1, round(self.height * share)))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Lens:
     """A COLMAP camera model with its parameters: `images.load_photo` undistorts photos by it."""
 

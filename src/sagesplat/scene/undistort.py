@@ -4,6 +4,7 @@ Implemented from the definitions in COLMAP's documentation (https://colmap.githu
 Kannala & Brandt 2006 (fisheye), Devernay & Faugeras 2001 (FOV), Weng et al. 1992 (thin prism).
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -109,14 +110,19 @@ def _fov(x, y, r2, omega):
     return x * scale.astype(r2.dtype), y * scale.astype(r2.dtype)
 
 
+@lru_cache(1024)  # computing one takes milliseconds, and the views of a capture share few lenses
 def pinhole(lens: Lens) -> Float[np.ndarray, "3 3"]:
     """K of the pinhole camera that replaces the lens, with the same image size and principal point.
+
+    Its own K where it has no distortion; not to be changed, since all who ask get the same array.
 
     Both focal lengths are scaled by the smallest zoom in [0.5, 4] at which every border pixel still has a
     source pixel: the widest view without blank pixels. Raises ValueError if there is none.
     """
     width, height = lens.width, lens.height
     K = intrinsics(lens)
+    if is_pinhole(lens):
+        return K
     t = np.linspace(0, 1, 33)
     across, down, zero = t * (width - 1), t * (height - 1), 0 * t
     u = np.concatenate([across, across, zero, zero + width - 1])

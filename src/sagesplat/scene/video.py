@@ -48,8 +48,6 @@ def extract_frames(
         from av.error import FFmpegError
     except ImportError:
         raise BackendUnavailable(f"frames of a video need PyAV; {install('sagesplat[video]')}") from None
-    if max_frames < 1:
-        raise SceneError(f"{path}: max_frames {max_frames} leaves nothing; take 1 or more")
     if not path.is_file():
         raise SceneError(f"{path}: no such file; name a video")
     stat = path.stat()

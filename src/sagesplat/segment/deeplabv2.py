@@ -31,6 +31,7 @@ from sagesplat.core.memory import ran_out
 from sagesplat.io.tensors import read_tensors
 from sagesplat.segment import coco
 from sagesplat.segment.crf import refine
+from sagesplat.segment.hub import torch_device
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.segmenters import (
     Segmented,
@@ -38,7 +39,6 @@ from sagesplat.segment.segmenters import (
     arg_max_resized,
     existing_file,
     group_classes,
-    parse_device,
 )
 from sagesplat.segment.taxonomies import to_coco, vocabulary
 
@@ -128,19 +128,16 @@ def _stage(inputs: int, width: int, blocks: int, *, stride: int, dilation: int) 
     return nn.Sequential(first, *others)
 
 
-def fuse_scales(
-    model: nn.Module, x: Float[Tensor, "B 3 H W"], scales: Sequence[float] = SCALES
-) -> Float[Tensor, "B C h w"]:
-    """The largest logit over the input at several scales (Sec. 4.1.2), at the size of the first one's.
+def fuse_scales(model: nn.Module, x: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B C h w"]:
+    """The largest logit over the input at all `SCALES` (Sec. 4.1.2), at the size of the first one's.
 
     Bilinear with align_corners=False, to which the PyTorch port trained its checkpoints.
     """
-    fused = None
-    for scale in scales:
+    fused = model(x)
+    for scale in SCALES[1:]:
         size = [max(1, int(scale * length)) for length in x.shape[2:]]
         logits = model(x if size == list(x.shape[2:]) else _resize(x, size))
-        fused = logits if fused is None else torch.maximum(fused, _resize(logits, fused.shape[2:]))
-    assert fused is not None, "scales are needed"
+        fused = torch.maximum(fused, _resize(logits, fused.shape[2:]))
     return fused
 
 
@@ -298,7 +295,7 @@ class DeepLabV2Segmenter:
     """The network with what its outputs mean: a `segmenters.Segmenter`.
 
     A photo is resized to `size` pixels along its longer side (None: as it is; the checkpoints were tested at
-    513) and seen at all `scales`. Probabilities of outputs of one category are summed before the label image
+    513) and seen at all `SCALES`. Probabilities of outputs of one category are summed before the label image
     is chosen. With `crf`, `crf.refine` has them first, at the size that the network sees. `device` is auto,
     cpu, cuda or cuda:N.
     """
@@ -309,18 +306,12 @@ class DeepLabV2Segmenter:
         classes: HeadClasses,
         *,
         size: int | None = 513,
-        scales: Sequence[float] = SCALES,
         crf: bool = False,
         device: str = "cpu",
     ):
         outputs, label_ids = classes.outputs, classes.label_ids
-        if max(outputs) >= model.num_classes or len(outputs) != len(label_ids):
-            raise LabelError(
-                f"DeepLabV2: {model.num_classes} outputs, which the classes do not fit; "
-                "take those that belong to the weights"
-            )
-        self.taxonomy, self.size, self.scales, self.crf = classes.taxonomy, size, scales, crf
-        self._device = _device(device)
+        self.taxonomy, self.size, self.crf = classes.taxonomy, size, crf
+        self._device = torch_device(device)
         self._model = model.eval().to(self._device)
         self._ids, rows = group_classes(label_ids)
         self._outputs = [np.array(outputs)[rows == k] for k in range(len(self._ids))]
@@ -343,15 +334,8 @@ class DeepLabV2Segmenter:
     def _scores(self, photo: UInt8[np.ndarray, "H W 3"]) -> Float32[Tensor, "1 K h w"]:
         """Log of each category's probability, but for a constant: log-sum-exp of its outputs."""
         bgr = torch.from_numpy(photo[..., ::-1].astype(np.float32)) - torch.tensor(MEAN_BGR)
-        logits = fuse_scales(self._model, bgr.permute(2, 0, 1)[None].to(self._device), self.scales).cpu()
+        logits = fuse_scales(self._model, bgr.permute(2, 0, 1)[None].to(self._device)).cpu()
         return torch.stack([logits[:, outputs].logsumexp(1) for outputs in self._outputs], 1)
-
-
-def _device(name: str) -> torch.device:
-    kind, index = parse_device(name)
-    if kind == "cuda" and index >= torch.cuda.device_count():
-        raise BackendUnavailable(f"device {name} is not there; use --device cpu")
-    return torch.device("cpu" if kind == "cpu" or not torch.cuda.is_available() else f"cuda:{index}")
 
 
 def _to_size(photo: UInt8[np.ndarray, "H W 3"], size: int | None) -> UInt8[np.ndarray, "h w 3"]:

@@ -88,7 +88,7 @@ def segmented(found: Found, label_ids: Sequence[int], threshold: float, size: tu
     order = np.argsort(-found.scores, kind="stable")
     for number, row in enumerate(order.tolist()):
         logits = _resized(found.masks[row], width, height)
-        value = sure[row] * _sigmoid(logits)
+        value = sure[row] * (1 / (1 + np.exp(-logits.clip(-30, 30))))
         wins = (logits > 0) & (value > best)
         best[wins], winner[wins] = value[wins], number
     ids = np.array([*np.array(label_ids, np.int16)[found.prompts[order]], UNLABELLED], np.int16)
@@ -126,7 +126,3 @@ def _resized(plane: Float32[np.ndarray, "h w"], width: int, height: int) -> Floa
     if plane.shape == (height, width):
         return plane
     return np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BILINEAR))
-
-
-def _sigmoid(logits: Float32[np.ndarray, "*S"]) -> Float32[np.ndarray, "*S"]:
-    return 1 / (1 + np.exp(-logits.clip(-30, 30)))

@@ -8,13 +8,18 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
-from PIL import Image
+from jaxtyping import Float32, UInt8
 from torch import Tensor
 
-from sagesplat.core.errors import LabelError
 from sagesplat.segment.detections import Boxes, without_duplicates
-from sagesplat.segment.hub import first_line, load_image_processor, load_model, load_tokenizer, package
+from sagesplat.segment.hub import (
+    finite,
+    load_image_processor,
+    load_model,
+    load_tokenizer,
+    package,
+    prepared,
+)
 
 _SEPARATORS = "[CLS]", "[SEP]", ".", "?"  # tokens at which Grounding DINO ends a phrase
 _MOST = 300  # boxes of a photo, those with the highest scores
@@ -43,7 +48,7 @@ class Detector:
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"], threshold: float) -> Boxes:
         """The boxes with a score of at least the threshold."""
         height, width = photo.shape[:2]
-        scores, parts = self.score(prepared(self.processor, photo, self.name).to(self.device))
+        scores, parts = self.score(prepared(self.processor, [photo], self.name).to(self.device))
         scores, parts = finite(scores, self.name), finite(parts, self.name)
         best, side = scores.max(0), max(width, height)
         corners = np.concatenate([parts[:, :2] - parts[:, 2:] / 2, parts[:, :2] + parts[:, 2:] / 2], 1)
@@ -145,18 +150,6 @@ def detector(
     return Detector(name, device, processor, score, pads)
 
 
-def prepared(processor: Any, photo: UInt8[np.ndarray, "H W 3"], name: str) -> Any:
-    """A photo as a network's input, by its own image processor; LabelError where that cannot take it."""
-    try:
-        return processor(images=[Image.fromarray(photo)], return_tensors="pt")
-    except (ValueError, ZeroDivisionError) as error:
-        height, width = photo.shape[:2]
-        raise LabelError(
-            f"{name}: cannot take a photo of {width} x {height} pixels ({first_line(error)}); "
-            "leave such photos out"
-        ) from None
-
-
 def padded_tokens(
     tokenizer: Any, words: Sequence[str], length: int, name: str, warn: Callable[[str], None]
 ) -> Any:
@@ -174,11 +167,3 @@ def fitting(tokens: list[int], most: int, words: str, name: str, warn: Callable[
     if len(tokens) > most:
         warn(f"{name}: reads {most} of the {len(tokens)} tokens of {words!r}; shorten it")
     return tokens[:most]
-
-
-def finite(values: Float[Tensor, "*S"], name: str) -> Float32[np.ndarray, "*S"]:
-    """A network's output as numpy; LabelError where it holds what is no number."""
-    found = values.float().cpu().numpy()
-    if not np.isfinite(found).all():
-        raise LabelError(f"{name}: scores that are not finite; try --device cpu or another network")
-    return found

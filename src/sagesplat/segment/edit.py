@@ -1,6 +1,6 @@
 """Operations on labels: merge categories, keep some of them, fold the rare ones into unlabelled."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -49,22 +49,12 @@ class Edited:
         return {**self.asked, "shares": self.shares, "dropped": self.dropped, "folded": self.folded}
 
 
-def parse_keep(text: str) -> tuple[str, ...]:
-    """The categories in "grass-merged,tree-merged"; LabelError for what is no name."""
-    return parse_names(text, "keep")
-
-
 def parse_names(text: str, option: str) -> tuple[str, ...]:
     """The categories in "chair 1,vase", which `option` was given; LabelError for what is no name."""
     names = tuple(name.strip() for name in text.split(",")) if text.strip() else ()
     if "" in names:
         raise LabelError(f"{option} {short(repr(text))}: a name is empty; write NAME,NAME")
     return tuple(dict.fromkeys(_named(name, option) for name in names))
-
-
-def parse_ignore(text: str) -> tuple[str, ...]:
-    """The categories in "person,car"; LabelError for what is no name."""
-    return parse_names(text, "ignore")
 
 
 def parse_merge(text: str) -> dict[str, str]:
@@ -176,9 +166,10 @@ def fold_table(
     shares = num_pixels / max(num_pixels.sum(), 1)
     left = {i: name for i, name in taxonomy.names.items() if num_pixels[i] and shares[i] >= min_share}
     if not left:
+        before = ", ".join(sorted(set(taxonomy.names.values()))) or "none"
         raise LabelError(
-            f"no category with pixels and at least {min_share:g} of them is left of "
-            f"{_listed(taxonomy) or 'none'}; keep more of them or lower min_share"
+            f"no category with pixels and at least {min_share:g} of them is left of {before}; "
+            "keep more of them or lower min_share"
         )
     table = np.full(len(num_pixels), UNLABELLED, np.int16)
     table[list(left)] = list(left)
@@ -247,7 +238,7 @@ def _valid_only(
 def _prepare(folder: Path, target: Path, views: Sequence[View], before: Taxonomy, after: Taxonomy) -> None:
     """Make a folder ready to be filled; one that is edited in place stays readable all the while."""
     if target.resolve() == folder.resolve():
-        Taxonomy(dict(sorted((before.names | after.names).items()))).write(target / "labels.json")
+        (before | after).write(target / "labels.json")
     else:
         prepare_folder(target, views)
 
@@ -259,16 +250,17 @@ def _check_unmerged(names: Sequence[str], merge: Mapping[str, str], option: str)
 
 
 def _check_known(taxonomy: Taxonomy, names: Mapping[str, str] | Sequence[str], option: str) -> None:
-    known = list(taxonomy.names.values())
+    known = taxonomy.names.values()
     for name in names:
         if name not in known:
-            close = get_close_matches(name, known, n=1)
-            hint = f"did you mean {close[0]}? " if close else ""
-            raise LabelError(f"{option}: no category {name!r}; {hint}there are {_listed(taxonomy) or 'none'}")
+            raise LabelError(f"{option}: no category {name!r}; {alternatives(name, sorted(set(known)))}")
 
 
-def _listed(taxonomy: Taxonomy) -> str:
-    return ", ".join(sorted(set(taxonomy.names.values())))
+def alternatives(name: str, known: Collection[str]) -> str:
+    """What an error says of the names that there are, with the one that may have been meant."""
+    close = get_close_matches(name, known, n=1)
+    hint = f"did you mean {close[0]}? " if close else ""
+    return f"{hint}there are {', '.join(known) or 'none'}"
 
 
 def free_id(name: str, taken: set[int]) -> int:

@@ -7,7 +7,7 @@ from jaxtyping import Int16
 
 from sagesplat.core.errors import LabelError
 from sagesplat.scene.images import photo_size
-from sagesplat.scene.raw_photos import RawPhoto, upright
+from sagesplat.scene.raw_photos import RawPhoto, same_aspect, upright
 from sagesplat.scene.scene import Camera, Lens, View
 from sagesplat.scene.undistort import is_pinhole, undistort
 
@@ -33,7 +33,7 @@ def fit(
     size = label_ids.shape[1], label_ids.shape[0]
     if raw is None:
         stored = view.lens or view.camera
-        if not _alike(size, (stored.width, stored.height)):
+        if not same_aspect(size, (stored.width, stored.height)):
             raise _refused(path, size, f"its photo has {stored.width} x {stored.height}")
         return _seen(label_ids, view.lens, view.camera)
     shown = _shown(size, view, raw, path)
@@ -50,7 +50,7 @@ def _shown(size: Size, view: View, raw: RawPhoto, path: Path) -> str:
     sizes = {"raw": (width, height)} | ({"stored": (height, width)} if raw.sideways else {})
     sizes["undistorted"] = photo_size(view.image_path)
     exact = [form for form, other in sizes.items() if size == other]
-    matching = exact or [form for form, other in sizes.items() if _alike(size, other)]
+    matching = exact or [form for form, other in sizes.items() if same_aspect(size, other)]
     flat = "{} x {}".format(*sizes["undistorted"])
     if not matching:
         raise _refused(path, size, f"its photo has {width} x {height}, and {flat} where it is undistorted")
@@ -67,11 +67,6 @@ def _refused(path: Path, size: Size, photo: str) -> LabelError:
         f"{path}: {size[0]} x {size[1]} pixels, but {photo}; label images show the whole photo, at any "
         "resolution"
     )
-
-
-def _alike(size: Size, other: Size) -> bool:
-    """Whether aspect ratios are equal: the smaller picture may be rounded to whole pixels, by up to one."""
-    return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 
 def _seen(label_ids: Int16[np.ndarray, "h w"], lens: Lens | None, camera: Camera) -> Int16[np.ndarray, "H W"]:

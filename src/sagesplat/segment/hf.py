@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int16, Int64, UInt8
-from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -23,13 +22,15 @@ from sagesplat.core.errors import LabelError, short
 from sagesplat.segment import coco
 from sagesplat.segment.hub import (
     computing,
-    first_line,
+    finite,
     folder_of,
     load_image_processor,
     load_model,
     load_tokenizer,
     loading,
+    model_setting,
     package,
+    prepared,
     quiet,
     read_config,
     torch_device,
@@ -55,8 +56,8 @@ class HfSegmenter:
 
     `device`: "auto" (a GPU where there is one), "cpu", "cuda" or "cuda:N"; a GPU computes in 16 bits.
     `threads` sets torch's for the whole process. `note` says where the network's own names of classes were
-    not trusted, `revision` is the commit that was downloaded. Raises LabelError for what is no such network,
-    BackendUnavailable where transformers, the network or the device cannot be had.
+    not trusted. Raises LabelError for what is no such network, BackendUnavailable where transformers, the
+    network or the device cannot be had.
     """
 
     def __init__(
@@ -64,7 +65,6 @@ class HfSegmenter:
         model: str | Path = DEFAULT_MODEL,
         *,
         device: str = "auto",
-        revision: str | None = None,
         threads: int | None = None,
     ):
         self._name = str(model)
@@ -72,11 +72,10 @@ class HfSegmenter:
         if threads is not None:
             torch.set_num_threads(threads)
         with quiet():
-            folder = folder_of(model, revision)
+            folder = folder_of(model)
             self._config = read_config(folder, self._name, FAMILIES, "universal segmentation")
             self._processor, self._task, self._model = _load(folder, self._name, self._config)
         self._model.to(self._device).eval()
-        self.revision = None if folder == Path(model) else folder.name
         names = [str(name) for _, name in sorted(self._config.id2label.items())]
         label_ids, self.note = class_ids(names, self._config.model_type, self._name)
         self._ids, group = group_classes(label_ids)
@@ -96,14 +95,15 @@ class HfSegmenter:
     @torch.inference_mode()
     def _segment(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[Segmented]:
         height, width = photos[0].shape[:2]
-        inputs = self._prepare(photos)
+        inputs = prepared(self._processor, photos, self._name)
         weights, masks = self._queries(inputs)
         size = self._covered(inputs, height, width)
         if inputs.get("patch_offsets"):
             images = self._merged(weights, masks, inputs, size, len(photos))
         else:
             images = (self._cropped(*of_photo, inputs, size) for of_photo in zip(weights, masks, strict=True))
-        found = [self._answer(scores, height, width) for scores in images]
+        scores = (finite(image, self._name) for image in images)
+        found = [Segmented(self._ids[arg_max_resized(of, height, width)]) for of in scores]
         if not self.instances:
             return found
         return [
@@ -135,17 +135,6 @@ class HfSegmenter:
                 crops.append((weights[row], masks[row]))
                 places.append(np.s_[begin:stop, 0:width] if tall else np.s_[0:height, begin:stop])
         return instances_of(crops, places, self._things, (height, width))
-
-    def _prepare(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]]) -> Any:
-        """The network's input by its own image processor. PIL images: arrays 3 pixels high are ambiguous."""
-        try:
-            return self._processor(images=[Image.fromarray(p) for p in photos], return_tensors="pt")
-        except (ValueError, ZeroDivisionError) as error:
-            height, width = photos[0].shape[:2]
-            raise LabelError(
-                f"{self._name}: cannot take a photo of {width} x {height} pixels ({first_line(error)}); "
-                "leave such photos out"
-            ) from None
 
     def _queries(self, inputs: Any) -> tuple[Float32[Tensor, "B Q K"], Float[Tensor, "B Q h w"]]:
         """Per query: the probability of each category, "no object" left out, and the logits of its mask."""
@@ -221,12 +210,6 @@ class HfSegmenter:
                     count[along] += 1
             yield total / count.clamp(min=1)
 
-    def _answer(self, scores: Float32[Tensor, "K h w"], height: int, width: int) -> Segmented:
-        """The label image of the largest scores."""
-        if not scores.isfinite().all():
-            raise LabelError(f"{self._name}: scores that are not finite; try --device cpu or another network")
-        return Segmented(self._ids[arg_max_resized(scores.cpu().numpy(), height, width)])
-
 
 def class_ids(names: Sequence[str], family: str, model: str) -> tuple[list[int | None], str | None]:
     """The COCO panoptic id of each class of a network, and a note where its names were not what decided.
@@ -278,8 +261,7 @@ def _task_tokens(folder: Path, config: Any) -> Int64[Tensor, "1 T"]:
 
 
 def _settings(config: MasksConfig) -> dict[str, Any]:
-    model = config.model or DEFAULT_MODEL
-    return {"model": Path(model) if Path(model).is_dir() else model}
+    return {"model": model_setting(config.model or DEFAULT_MODEL)}
 
 
 def _load_segmenter(

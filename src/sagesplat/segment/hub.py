@@ -5,12 +5,16 @@ Weights are safetensors and no code of theirs runs. Whatever transformers says b
 
 import re
 import textwrap
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float, Float32, UInt8
+from PIL import Image
+from torch import Tensor
 
 from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory, SageError, short
 from sagesplat.core.extras import install
@@ -33,7 +37,12 @@ def torch_device(device: str) -> torch.device:
     return torch.device("cuda", index)
 
 
-def folder_of(model: str | Path, revision: str | None = None) -> Path:
+def model_setting(model: str) -> Path | str:
+    """What answers depend on of a network: its folder, whose content counts, or its name."""
+    return Path(model) if Path(model).is_dir() else model
+
+
+def folder_of(model: str | Path) -> Path:
     """The folder of a network: the one given, or that of the cache after a download where needed."""
     name = str(model)
     if name and Path(name).is_dir():
@@ -42,12 +51,11 @@ def folder_of(model: str | Path, revision: str | None = None) -> Path:
         raise LabelError(f"{name}: no such folder; name one with config.json, or a network as owner/name")
     huggingface_hub = package("huggingface_hub")
     try:
-        return Path(huggingface_hub.snapshot_download(name, revision=revision, allow_patterns=_FILES))
+        return Path(huggingface_hub.snapshot_download(name, allow_patterns=_FILES))
     except Exception as error:  # of the hub's client, of its HTTP library or of the disk
-        version = f" --revision {revision}" if revision else ""
         raise BackendUnavailable(
             f"{name}: no folder, not in Hugging Face's cache, and no download ({first_line(error)}); "
-            f"where there is a network: hf download {name}{version}, then set HF_HUB_OFFLINE=1"
+            f"where there is a network: hf download {name}, then set HF_HUB_OFFLINE=1"
         ) from None
 
 
@@ -110,6 +118,29 @@ def load_tokenizer(folder: Path) -> Any:
     if not any((folder / name).is_file() for name in _VOCABULARIES):
         raise OSError(f"no {', '.join(_VOCABULARIES)}")
     return package("transformers").AutoTokenizer.from_pretrained(folder, trust_remote_code=False)
+
+
+def prepared(processor: Any, photos: Sequence[UInt8[np.ndarray, "H W 3"]], name: str) -> Any:
+    """Photos as a network's input, by its own image processor; LabelError where that cannot take them.
+
+    They are passed as PIL images: arrays 3 pixels high are ambiguous.
+    """
+    try:
+        return processor(images=[Image.fromarray(photo) for photo in photos], return_tensors="pt")
+    except (ValueError, ZeroDivisionError) as error:
+        height, width = photos[0].shape[:2]
+        raise LabelError(
+            f"{name}: cannot take a photo of {width} x {height} pixels ({first_line(error)}); "
+            "leave such photos out"
+        ) from None
+
+
+def finite(values: Float[Tensor, "*S"], name: str) -> Float32[np.ndarray, "*S"]:
+    """A network's output as numpy; LabelError where it holds what is no number."""
+    found = values.float().cpu().numpy()
+    if not np.isfinite(found).all():
+        raise LabelError(f"{name}: scores that are not finite; try --device cpu or another network")
+    return found
 
 
 def package(name: str) -> Any:

@@ -7,28 +7,21 @@ import numpy as np
 from jaxtyping import Int16
 from PIL import Image
 
-from sagesplat.core.errors import LabelError, short
-from sagesplat.core.names import checked
+from sagesplat.core.errors import LabelError
 from sagesplat.io.files import atomic_path
-from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
+from sagesplat.io.pictures import FREE_PIXELS
 from sagesplat.scene.raw_photos import raw_photos
-from sagesplat.scene.scene import Scene, View
+from sagesplat.scene.scene import Scene
 from sagesplat.segment import coco
 from sagesplat.segment.fit import fit
 from sagesplat.segment.mask_files import panoptic_segments
-from sagesplat.segment.masks import VOID_16, mask_path
+from sagesplat.segment.masks import VOID_8, VOID_16, given_png, mask_path, read_png
 
 NO_INSTANCE = -1
 FOLDER = "instances"  # of a capture, beside its masks
 EVERY, THINGS = "*", "things"  # in place of category names
 _MOST = 4096  # instances of a photo
 _LAST_THING = 90  # COCO's ids of stuff follow
-_CURE = "give one channel of 16-bit numbers, 65535 where there is no instance"
-
-
-def instance_path(folder: Path, view: View) -> Path:
-    """Where a folder keeps the instances of a view's photo."""
-    return mask_path(folder, view)
 
 
 def write_instances(path: Path, instances: Int16[np.ndarray, "H W"]) -> None:
@@ -45,21 +38,13 @@ def read_instances(path: Path, size: tuple[int, int] | None = None) -> Int16[np.
     width) where that is given. Memory: up to 20 bytes per pixel.
     """
     free = FREE_PIXELS if size is None else max(FREE_PIXELS, 4 * size[0] * size[1])
-    try:
-        with open_picture(path, ("PNG",), free=free) as image:
-            mode, pixels = image.mode, np.asarray(image)
-    except PictureError as error:
-        if not path.exists():
-            raise LabelError(f"{path}: no such file; find the instances again") from None
-        raise LabelError(f"{path}: not a readable PNG ({error.reason}); {error.cure or _CURE}") from None
-    if mode not in ("I;16", "I", "L", "P"):
-        raise LabelError(f"{path}: a PNG of mode {mode}; {_CURE}")
+    pixels = read_png(path, free, cure="find the instances again")
     if size is not None and pixels.shape != size:
         raise LabelError(
             f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels where the photo has {size[1]} x "
             f"{size[0]}; find the instances again at this size"
         )
-    return _renumbered(pixels, 255 if mode in ("L", "P") else VOID_16, path)
+    return _renumbered(pixels, VOID_8 if pixels.dtype == np.uint8 else VOID_16, path)
 
 
 def _renumbered(pixels: np.ndarray, void: int, path: Path) -> Int16[np.ndarray, "H W"]:
@@ -91,14 +76,14 @@ def import_instances(scene: Scene, masks: Path, target: Path) -> int:
     segments = panoptic_segments(masks)
     raw, found = raw_photos(scene.path), 0
     for view in scene.views:
-        path = _existing(folder, view)
+        path = given_png(folder, view.name)
         if path is not None:
             instances = read_instances(path)
         elif segments is not None and (given := segments(view.name)) is not None:
             path, instances = given[0], _renumbered(given[1], 0, given[0])
         else:
             continue
-        write_instances(instance_path(target, view), fit(instances, view, raw.get(view.name), path))
+        write_instances(mask_path(target, view), fit(instances, view, raw.get(view.name), path))
         found += 1
     if not found:
         name = PurePosixPath(scene.views[0].name).with_suffix(".png")
@@ -107,22 +92,6 @@ def import_instances(scene: Scene, masks: Path, target: Path) -> int:
             "65535 for none), or leave out --labels.instances"
         )
     return found
-
-
-def _existing(folder: Path, view: View) -> Path | None:
-    paths = (folder / f"{view.name}.png", instance_path(folder, view))
-    return next((path for path in paths if path.is_file()), None)
-
-
-def parse_instances(text: str) -> tuple[str, ...]:
-    """The categories in "chair,car"; LabelError for what is no name."""
-    names = []
-    for name in dict.fromkeys(part.strip() for part in text.split(",")) if text.strip() else ():
-        try:
-            names.append(checked(name))
-        except ValueError as error:
-            raise LabelError(f"instances {short(repr(name))}: {error}; write NAME,NAME") from None
-    return tuple(names)
 
 
 def wanted_ids(names: dict[int, str], wanted: Sequence[str]) -> list[int]:

@@ -11,13 +11,11 @@ from jaxtyping import Bool, Float32, Int16, Int32, Int64, Shaped
 from sagesplat.core.errors import LabelError, short
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
-from sagesplat.scene.scene import Camera, Scene
+from sagesplat.scene.scene import Scene
 from sagesplat.segment.masks import UNLABELLED, Masks
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
-IGNORED = (
-    -2
-)  # label of the points that no Gaussian is to begin at: they show what does not belong to the scene
+IGNORED = -2  # label of points at which no Gaussian begins: they show what does not belong to the scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +42,8 @@ class LiftedLabels:
     @property
     def agreement(self) -> float:
         """Share of all votes that agree with the label of their point; NaN without a vote."""
-        return _share(self.num_agreeing, self.num_votes)
+        votes = int(self.num_votes.sum())
+        return float(self.num_agreeing.sum() / votes) if votes else float("nan")
 
     def write(self, path: Path) -> None:
         """Write labels.npz."""
@@ -164,18 +163,7 @@ def _track_pixels(scene: Scene) -> Iterator[tuple[Int64[np.ndarray, " M"], Float
 def _projected_pixels(scene: Scene) -> Iterator[tuple[Int64[np.ndarray, " M"], Float32[np.ndarray, "M 2"]]]:
     """View by view: the points in front of the camera, and where it sees them."""
     for view in scene.views:
-        yield _project(view.camera, scene.points.xyz)
-
-
-def _project(
-    camera: Camera, xyz: Float32[np.ndarray, "P 3"]
-) -> tuple[Int64[np.ndarray, " M"], Float32[np.ndarray, "M 2"]]:
-    """Rows of the points in front of a camera, and their pixels."""
-    seen = xyz @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
-    rows = np.flatnonzero(seen[:, 2] > 1e-6)
-    homogeneous = seen[rows] @ camera.K.T
-    return rows, homogeneous[:, :2] / homogeneous[:, 2:]
-
-
-def _share(part: np.ndarray, whole: np.ndarray) -> float:
-    return float(part.sum() / whole.sum()) if whole.sum() else float("nan")
+        seen = scene.points.xyz @ view.camera.w2c[:3, :3].T + view.camera.w2c[:3, 3]
+        rows = np.flatnonzero(seen[:, 2] > 1e-6)
+        homogeneous = seen[rows] @ view.camera.K.T
+        yield rows, homogeneous[:, :2] / homogeneous[:, 2:]

@@ -18,8 +18,8 @@ from sagesplat.segment.masks import (
     VOID_8,
     VOID_16,
     Taxonomy,
+    given_png,
     num_pixels,
-    png_path,
     prepare_folder,
     read_labels,
     read_png,
@@ -51,8 +51,6 @@ def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
     """
     if source.resolve() == target.resolve():
         raise LabelError(f"{source}: these are the masks of the run itself; name the folder they came from")
-    if not source.is_dir():
-        raise LabelError(f"{source}: no such folder; name the one with the label images")
     taxonomy, find = _source(source)
     found = {view.name: find(view.name) for view in scene.views}
     missing = [name for name, file in found.items() if file is None]
@@ -94,8 +92,6 @@ def label_images_of(folder: Path) -> tuple[Taxonomy, Callable[[str], Int16[np.nd
 
     None for a photo without one. LabelError as of `import_masks`.
     """
-    if not folder.is_dir():
-        raise LabelError(f"{folder}: no such folder; name the one with the label images")
     taxonomy, find = _source(folder)
 
     def read(name: str) -> Int16[np.ndarray, "h w"] | None:
@@ -106,6 +102,8 @@ def label_images_of(folder: Path) -> tuple[Taxonomy, Callable[[str], Int16[np.nd
 
 
 def _source(folder: Path) -> tuple[Taxonomy, _Find]:
+    if not folder.is_dir():
+        raise LabelError(f"{folder}: no such folder; name the one with the label images")
     return _id_source(folder) if (folder / "labels.json").exists() else _panoptic_source(folder)
 
 
@@ -117,8 +115,7 @@ def _id_source(folder: Path) -> tuple[Taxonomy, _Find]:
     cure = 'name them in labels.json (or say there which value is "unlabelled")'
 
     def find(name: str) -> _File | None:
-        paths = (folder / f"{name}.png", png_path(folder, name))
-        path = next((p for p in paths if p.exists()), None)
+        path = given_png(folder, name)
         return None if path is None else _File(path, ids, False, cure)
 
     return taxonomy, find

@@ -13,8 +13,15 @@ from torch import Tensor
 from sagesplat.core.errors import BackendUnavailable, RunError
 from sagesplat.io.typed import known_json
 from sagesplat.segment.detections import Boxes, Found
-from sagesplat.segment.detectors import finite, padded_tokens, prepared
-from sagesplat.segment.hub import load_image_processor, load_model, load_tokenizer, package
+from sagesplat.segment.detectors import padded_tokens
+from sagesplat.segment.hub import (
+    finite,
+    load_image_processor,
+    load_model,
+    load_tokenizer,
+    package,
+    prepared,
+)
 
 BOX_FAMILIES = {"sam", "sam2", "sam2_video"}
 WORD_FAMILIES = {"clipseg": 0.4, "sam3": 0.5, "sam3_video": 0.5}  # family: usual threshold
@@ -65,7 +72,7 @@ class BoxMasks:
         if not self._first:
             pixels = self._input(photo).to(self._device)
             return pixels, (pixels.shape[2], pixels.shape[3])
-        inputs = prepared(self._processor, photo, self.name)
+        inputs = prepared(self._processor, [photo], self.name)
         height, width = (int(size) for size in inputs["reshaped_input_sizes"][0])
         return inputs["pixel_values"].to(self._device), (height, width)
 
@@ -110,7 +117,7 @@ class ClipSeg:
     @torch.inference_mode()
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"], /) -> Found:
         """What is in a photo."""
-        pixels = prepared(self._processor, photo, self.name)["pixel_values"].to(self._device)
+        pixels = prepared(self._processor, [photo], self.name)["pixel_values"].to(self._device)
         ids, mask = self._text["input_ids"], self._text["attention_mask"]
         planes = []
         for start in range(0, len(ids), _WORDS_TOGETHER):

@@ -24,6 +24,7 @@ UNLABELLED_NAME = "unlabelled"
 UNLABELLED_COLOR = (128, 128, 128)
 MAX_LABEL_ID = np.iinfo(np.int16).max
 UNKNOWN = -2  # never leaves this file
+CACHE_BYTES = 2**28  # of the images of a folder that are kept in memory
 _BLOCK = len("@4095")  # what a per-block category adds to the name of its category
 VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
 
@@ -74,12 +75,12 @@ class Taxonomy:
 class Masks:
     """The label images of a normalised folder (what `import_masks` or `segment_views` wrote), read lazily.
 
-    Images are kept until `cache_bytes` are full; the rest is read anew each time, since the stages visit all
+    Images are kept until `CACHE_BYTES` are full; the rest is read anew each time, since the stages visit all
     views in turn.
     """
 
-    def __init__(self, folder: Path, taxonomy: Taxonomy, cache_bytes: int = 2**28):
-        self.folder, self.taxonomy, self.cache_bytes = folder, taxonomy, cache_bytes
+    def __init__(self, folder: Path, taxonomy: Taxonomy):
+        self.folder, self.taxonomy = folder, taxonomy
         self._cache: dict[str, Int16[np.ndarray, "H W"]] = {}
         self._used = 0
 
@@ -88,7 +89,7 @@ class Masks:
         label_ids = self._cache.get(view.name)
         if label_ids is None:
             label_ids = read_mask(mask_path(self.folder, view), self.taxonomy, num_pixels(view))
-            if self._used + label_ids.nbytes <= self.cache_bytes:
+            if self._used + label_ids.nbytes <= CACHE_BYTES:
                 self._cache[view.name] = label_ids
                 self._used += label_ids.nbytes
         (h, w), camera = label_ids.shape, view.camera
@@ -111,6 +112,12 @@ def png_path(folder: Path, photo: str) -> Path:
     if name.is_absolute() or ".." in name.parts:
         raise LabelError(f"{photo}: a photo outside the image folder; move it there and rename it")
     return folder / name.with_suffix(".png")
+
+
+def given_png(folder: Path, photo: str) -> Path | None:
+    """The PNG that a folder of the user's has of a photo: x.jpg.png or x.png of x.jpg."""
+    paths = (folder / f"{photo}.png", png_path(folder, photo))
+    return next((path for path in paths if path.is_file()), None)
 
 
 def prepare_folder(folder: Path, views: Sequence[View]) -> list[Path]:
@@ -194,8 +201,13 @@ def taxonomy_of(names: dict[int, Any], path: Path, length: int = LENGTH) -> Taxo
     return Taxonomy({label_id: name for name, label_id in sorted(found.items(), key=lambda of: of[1])})
 
 
-def read_png(path: Path, free: int, segments: bool = False) -> Integer[np.ndarray, "h w"]:
-    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`."""
+def read_png(
+    path: Path, free: int, segments: bool = False, cure: str = "make the masks again"
+) -> Integer[np.ndarray, "h w"]:
+    """The ids in a PNG: grey values or palette indices, or R + 256 G + 65536 B with `segments`.
+
+    `free` as in `read_mask`; `cure`: of a file that is not there.
+    """
     modes = ("RGB", "RGBA") if segments else ("1", "L", "P", "I;16", "I")
     try:
         with open_picture(path, ("PNG",), free=free) as image:
@@ -203,9 +215,9 @@ def read_png(path: Path, free: int, segments: bool = False) -> Integer[np.ndarra
             pixels = np.asarray(image) if mode in modes else None
     except PictureError as error:
         if not path.exists():
-            raise LabelError(f"{path}: no such file; make the masks again") from None
-        cure = error.cure or "export it again"
-        raise LabelError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
+            raise LabelError(f"{path}: no such file; {cure}") from None
+        reason = f"{error.reason}); {error.cure or 'export it again'}"
+        raise LabelError(f"{path}: not a readable PNG ({reason}") from None
     if pixels is None:
         wanted = "an RGB image of segments" if segments else "one channel of 8- or 16-bit ids"
         raise LabelError(f"{path}: a PNG of mode {mode} where {wanted} is needed; convert it")

@@ -147,8 +147,9 @@ class OnnxSegmenter:
         output = self._run(photo)
         if np.issubdtype(output.dtype, np.integer):
             return self._of_numbers(output, height, width)
-        axis = class_axis(output.shape, len(self._group), self._channels)
-        if axis is None:
+        likely = (self._channels, 4 - self._channels)  # the axis of the input's channels, else the other one
+        axes = (a for a in likely if output.ndim == 4 and output.shape[a] == len(self._group))
+        if (axis := next(axes, None)) is None:
             raise self._unfit(output)
         logits = np.moveaxis(output[0], axis - 1, 0).astype(np.float32, copy=False)
         return Segmented(self._ids[arg_max_resized(self._grouped(logits), height, width)])
@@ -253,11 +254,6 @@ def to_input(
     """The photo at the network's input size (bilinear, antialiased where it shrinks), normalised."""
     small = Image.fromarray(photo).resize((width, height), Image.Resampling.BILINEAR)
     return (np.asarray(small, np.float32) / 255 - classes.mean) / classes.std
-
-
-def class_axis(shape: Sequence[int], num_classes: int, likely: int) -> int | None:
-    """The axis of the classes in an output of four: the input's channel axis, or else the other one."""
-    return next((a for a in (likely, 4 - likely) if len(shape) == 4 and shape[a] == num_classes), None)
 
 
 def _first_line(error: Exception) -> str:

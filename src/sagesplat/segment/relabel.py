@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 
 import numpy as np
 from jaxtyping import Int16, Int32
@@ -19,7 +18,7 @@ from sagesplat.formats.label_edits import (
     Weigh,
     ranks_of,
 )
-from sagesplat.segment.edit import free_id
+from sagesplat.segment.edit import alternatives, free_id
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_NAME
 
 
@@ -64,9 +63,7 @@ class Relabelled:
     @property
     def changed(self) -> list[int]:
         """The new categories whose Gaussians are not exactly those of the old category of their id."""
-        return [
-            new for new, old in self.sources.items() if old != [new] or self.moved(new) is None
-        ]  # fmt: skip
+        return [new for new, old in self.sources.items() if old != [new] or self.moved(new) is None]
 
 
 @dataclass
@@ -161,9 +158,7 @@ def _apply(state: _State, operation: Operation) -> None:
 def _find(state: _State, name: str) -> int:
     if name in state.number_of:
         return state.number_of[name]
-    close = get_close_matches(name, state.number_of, n=1)
-    hint = f"did you mean {close[0]}? " if close else ""
-    raise LabelError(f"no category {name!r}; {hint}there are {', '.join(sorted(state.number_of))}")
+    raise LabelError(f"no category {name!r}; {alternatives(name, sorted(state.number_of))}")
 
 
 def _check_free(state: _State, name: str) -> None:

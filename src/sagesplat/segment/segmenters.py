@@ -16,11 +16,12 @@ from sagesplat.io.files import write_json
 from sagesplat.io.lock import locked
 from sagesplat.io.typed import known_json
 from sagesplat.scene.scene import Scene, View
-from sagesplat.segment.instances import instance_path, write_instances
+from sagesplat.segment.instances import write_instances
 from sagesplat.segment.masks import (
     UNLABELLED,
     Masks,
     Taxonomy,
+    mask_path,
     prepare_folder,
     read_mask,
     write_labels,
@@ -156,7 +157,7 @@ def segment_some(
         if below is not None:
             label_ids = np.where(label_ids != UNLABELLED, label_ids, below[scene.views[row]])
         if instances is not None and found.instances is not None:
-            write_instances(instance_path(instances, scene.views[row]), found.instances)
+            write_instances(mask_path(instances, scene.views[row]), found.instances)
         write_mask(paths[row], label_ids, taxonomy)
         finish(label_ids)
     return occurring
@@ -177,11 +178,7 @@ def _finished(path: Path, taxonomy: Taxonomy, view: View) -> Int16[np.ndarray, "
         label_ids = read_mask(path, taxonomy)
     except LabelError:
         return None
-    return label_ids if label_ids.shape == _size(view) else None
-
-
-def _size(view: View) -> tuple[int, int]:
-    return view.camera.height, view.camera.width
+    return label_ids if label_ids.shape == (view.camera.height, view.camera.width) else None
 
 
 def group_classes(label_ids: Sequence[int | None]) -> tuple[Int16[np.ndarray, " K"], np.ndarray]:

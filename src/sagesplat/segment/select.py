@@ -1,7 +1,6 @@
 """Gaussians by the names of categories and instances."""
 
 from collections.abc import Mapping
-from difflib import get_close_matches
 
 import torch
 from jaxtyping import Bool
@@ -10,6 +9,7 @@ from torch import Tensor
 from sagesplat.core.errors import LabelError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import composed
+from sagesplat.segment.edit import alternatives
 from sagesplat.segment.parents import with_instances
 
 
@@ -36,10 +36,8 @@ def select_mask(
     for name in (part.strip() for part in wanted.split(",")):
         ids = with_instances(names, of, composed(name))
         if not ids:
-            close = get_close_matches(name, names.values(), n=1)
-            hint = f"did you mean {close[0]}? " if close else ""
-            known = ", ".join(names.values()) or "none"
-            raise LabelError(f"no category or instance {short(repr(name))}; {hint}there are {known}")
+            known = alternatives(name, names.values())
+            raise LabelError(f"no category or instance {short(repr(name))}; {known}")
         found += ids
     ids = torch.tensor(found, dtype=gaussians.label_ids.dtype, device=gaussians.label_ids.device)
     return torch.isin(gaussians.label_ids, ids)

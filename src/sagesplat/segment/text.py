@@ -4,7 +4,6 @@ Grounding DINO or OWLv2 find boxes and SAM 2 makes masks of them; CLIPSeg and SA
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,15 @@ from sagesplat.io.typed import check_limits
 from sagesplat.segment.detections import Finder, painted_over, segmented, shared_areas
 from sagesplat.segment.detectors import DETECTORS, detector
 from sagesplat.segment.display_names import title_of
-from sagesplat.segment.hub import computing, folder_of, loading, quiet, read_config, torch_device
+from sagesplat.segment.hub import (
+    computing,
+    folder_of,
+    loading,
+    model_setting,
+    quiet,
+    read_config,
+    torch_device,
+)
 from sagesplat.segment.mask_networks import BOX_FAMILIES, WORD_FAMILIES, BoxFinder, BoxMasks, ClipSeg, Sam3
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.prompts import Prompt, parse_prompts, prompts_of
@@ -86,8 +93,8 @@ def settings(config: MasksConfig) -> dict[str, Any]:
     if config.segmenter == "text" and config.model and config.prompt_model:
         raise RunError("--model and --prompt-model name the same network here; leave one of them")
     return {
-        "model": _named(detector_of(config)),
-        "mask_model": _named(config.mask_model or DEFAULT_MASK_MODEL),
+        "model": model_setting(detector_of(config)),
+        "mask_model": model_setting(config.mask_model or DEFAULT_MASK_MODEL),
         "prompts": list(parse_prompts(config.prompts)),
         "prompt_threshold": config.prompt_threshold,
     }
@@ -97,10 +104,6 @@ def detector_of(config: MasksConfig) -> str:
     """The network that is asked for the prompts: --model is one of another segmenter where there is one."""
     own = config.model if config.segmenter == "text" else None
     return config.prompt_model or own or DEFAULT_DETECTOR
-
-
-def _named(model: str) -> Path | str:
-    return Path(model) if Path(model).is_dir() else model
 
 
 def load_text(

@@ -5,7 +5,7 @@ Pixels do not count where a category is ignored, where a mask of the photo is bl
 """
 
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
 from sagesplat.scene.raw_photos import RawPhoto, raw_photos
 from sagesplat.scene.scene import Scene, View
 from sagesplat.segment.fit import fit
-from sagesplat.segment.masks import Masks, mask_path
+from sagesplat.segment.masks import CACHE_BYTES, Masks, given_png, mask_path
 
 Pixels = Bool[np.ndarray, "H W"]
 
@@ -28,11 +28,11 @@ Pixels = Bool[np.ndarray, "H W"]
 class ValidPixels:
     """Which pixels of the views count, from a folder that `write_valid` wrote; without one all of them.
 
-    Images are kept until `cache_bytes` are full, as those of `Masks` are.
+    Images are kept until `CACHE_BYTES` are full, as those of `Masks` are.
     """
 
-    def __init__(self, folder: Path | None = None, cache_bytes: int = 2**28):
-        self.folder, self.cache_bytes = folder, cache_bytes
+    def __init__(self, folder: Path | None = None):
+        self.folder = folder
         self._cache: dict[str, Pixels] = {}
         self._used = 0
 
@@ -46,7 +46,7 @@ class ValidPixels:
         if self.folder is None or not (path := mask_path(self.folder, view)).exists():
             return None
         valid = read_valid(path, view)
-        if self._used + valid.nbytes <= self.cache_bytes:
+        if self._used + valid.nbytes <= CACHE_BYTES:
             self._cache[view.name] = valid
             self._used += valid.nbytes
         return valid
@@ -79,7 +79,6 @@ def write_valid(
     label_ids: Masks | None = None,
     ignore: Collection[int] = (),
     dilation: int = 0,
-    on_view: Callable[[int, int], None] | None = None,
 ) -> Float32[np.ndarray, " V"]:
     """Find the pixels of all views that do not count, and write an image for each view that has some.
 
@@ -89,7 +88,6 @@ def write_valid(
         label_ids: Label images; needed for `ignore`.
         ignore: Category ids whose pixels do not count.
         dilation: Pixels by which regions that do not count are grown.
-        on_view: Called with (views done, views in all).
 
     Returns:
         Share of each view's pixels that do not count; 1 where none does.
@@ -111,8 +109,6 @@ def write_valid(
                 valid = np.asarray(minimum_filter(valid, 2 * dilation + 1, mode="nearest"))
             shares[row] = 1 - valid.mean()
             write_view(target, view, valid)
-        if on_view:
-            on_view(row + 1, len(scene.views))
     if (shares[scene.train_ids] == 1).all():
         raise LabelError(
             f"{scene.path}: no pixel of any training photo counts; ignore fewer categories, or mend the "
@@ -149,10 +145,7 @@ class _Given:
         return valid
 
     def _in_folder(self, view: View) -> Path | None:
-        if self.folder is None:
-            return None
-        paths = (self.folder / f"{view.name}.png", mask_path(self.folder, view))
-        return next((path for path in paths if path.is_file()), None)
+        return None if self.folder is None else given_png(self.folder, view.name)
 
 
 def _seen(path: Path, view: View, raw: RawPhoto | None) -> Pixels:

@@ -24,17 +24,15 @@ from sagesplat.scene.blocks import read_blocks
 from sagesplat.scene.scene import View
 from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.display_names import title_of
-from sagesplat.segment.edit import apply, edit_table
+from sagesplat.segment.edit import apply, edit_table, parse_names
 from sagesplat.segment.instances import (
     FOLDER,
     import_instances,
-    instance_path,
-    parse_instances,
     read_instances,
     wanted_ids,
 )
 from sagesplat.segment.lift import LiftedLabels, lift
-from sagesplat.segment.masks import Masks, Taxonomy, prepare_folder, write_mask
+from sagesplat.segment.masks import Masks, Taxonomy, mask_path, prepare_folder, write_mask
 from sagesplat.segment.parents import write_parents
 from sagesplat.stages.label import later_merges, segmenter_kind
 from sagesplat.stages.scene import check_not_adopted
@@ -46,9 +44,9 @@ _LISTED = 8  # instances that are named in a line
 def find_photo_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> None:
     """Import the instances of the photos, or check that the network found some: before hours of training."""
     run = job.run
-    wanted_ids(Taxonomy.read(run.masks / "labels.json").names, parse_instances(labels.instances))
+    wanted_ids(Taxonomy.read(run.masks / "labels.json").names, parse_names(labels.instances, "instances"))
     if segmenter_kind(job.scene.path, masks) != "masks":
-        if not any(instance_path(run.photo_instances, view).exists() for view in job.scene.views):
+        if not any(mask_path(run.photo_instances, view).exists() for view in job.scene.views):
             raise RunError(
                 f"{run.photo_instances}: no instances of any photo; the network has none, or segmented the "
                 "photos without: add --force to segment them again, or leave out --labels.instances"
@@ -72,7 +70,7 @@ def find_photo_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> 
 def _check_seen(job: Job) -> None:
     """RunError unless two training photos have instances: one that a single photo shows is none."""
     views = [job.scene.views[row] for row in job.scene.train_ids.tolist()]
-    seen = sum(instance_path(job.run.photo_instances, view).exists() for view in views)
+    seen = sum(mask_path(job.run.photo_instances, view).exists() for view in views)
     if seen < 2:
         raise RunError(
             f"{job.run.photo_instances}: instances of {seen} of {len(views)} training photos; give those of "
@@ -98,7 +96,7 @@ def make_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> None:
             _remove(run)
         return
     find_photo_instances(job, masks, labels)
-    wanted = parse_instances(labels.instances)
+    wanted = parse_names(labels.instances, "instances")
     merge = later_merges(run, labels)
     outputs = [run.instances / "labels.json", run.instance_labels]
     stages = ["masks", "train", "fuse"]
@@ -148,7 +146,7 @@ def _find(job: Job, g: Gaussians, masks: Masks, ids: list[int]) -> Instances:
     views = job.scene.train_ids.tolist()
 
     def of_photo(view: View) -> np.ndarray | None:
-        path = instance_path(job.run.photo_instances, view)
+        path = mask_path(job.run.photo_instances, view)
         return read_instances(path, (view.camera.height, view.camera.width)) if path.exists() else None
 
     sightings = gather(

@@ -28,9 +28,8 @@ from sagesplat.segment.edit import (
     Edited,
     edit_labels,
     ignored_ids,
-    parse_ignore,
-    parse_keep,
     parse_merge,
+    parse_names,
 )
 from sagesplat.segment.lift import agreement_in, lift
 from sagesplat.segment.mask_files import import_masks
@@ -57,7 +56,8 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
     else:
         _segment(job, config, kind, instances=bool(labels.instances))
     labels = replace(labels, merge=_of_categories(run, labels))
-    merge, keep, ignore = parse_merge(labels.merge), parse_keep(labels.keep), parse_ignore(labels.ignore)
+    merge = parse_merge(labels.merge)
+    keep, ignore = parse_names(labels.keep, "keep"), parse_names(labels.ignore, "ignore")
 
     def make() -> list[str]:
         shutil.rmtree(run.masks, ignore_errors=True)

@@ -28,7 +28,7 @@ from sagesplat.scene.detect import detect
 from sagesplat.scene.feature_masks import OfPhoto
 from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
-from sagesplat.segment.edit import ignored_ids, parse_ignore, parse_merge
+from sagesplat.segment.edit import ignored_ids, parse_merge, parse_names
 from sagesplat.segment.mask_files import label_images_of
 from sagesplat.stages.edited import check_not_edited
 
@@ -210,7 +210,7 @@ class _LeavingOut:
         if self.folder is None:
             return lambda name: None
         taxonomy, read = label_images_of(self.folder)
-        names, merge = parse_ignore(self.labels.ignore), parse_merge(self.labels.merge)
+        names, merge = parse_names(self.labels.ignore, "ignore"), parse_merge(self.labels.merge)
         ids = np.array(ignored_ids(taxonomy, names, merge)[0], np.int16)
 
         def of_photo(name: str) -> np.ndarray | None:
