@@ -145,20 +145,6 @@ def test_every_category_is_on_it(written):
     assert "nan" not in page.text.lower().split()
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_exposures_of_the_photos_are_said(tmp_path):
-    data = make()
-    assert "cc_psnr" not in write_report(tmp_path / "a", data).read_text("utf-8").split("All numbers")[0]
-    more = dataclasses.replace(
-        data, exposed=True, noticed=("exposure varies by 0.8 EV", "3 floaters removed")
-    )
-    page = write_report(tmp_path / "b", more).read_text("utf-8")
-    assert "Noticed in this capture, and dealt with: exposure varies by 0.8 EV; 3 floaters removed." in page
-    said = page.split("<h2>What each category gets</h2>")[1].split("<table>")[0]
-    assert "The photos differ in exposure" in said
-    assert "cc_ssim 0.750 and cc_psnr 0.75 dB" in said
-
-
 def test_headline_is_computed_from_unseen_views(written):
     _, data, page = written
     plan = data.plans[1]
@@ -358,15 +344,6 @@ def full_count(data: ReportData) -> int:
     return sum(n for (_, level), n in data.counts.items() if level == LEVELS[-1])
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_an_address_is_a_qr_code_only_where_there_is_one(whole, tmp_path):
-    assert "QR code of" not in whole.read_text("utf-8")
-    data = dataclasses.replace(whole_page(), url="https://example.org/x/")
-    page = write_report(tmp_path, data).read_text("utf-8")
-    assert '<a href="https://example.org/x/">' in page
-    assert re.search(r'<img class="qr" src="data:image/svg\+xml[^"]{400,}" alt="QR code of https', page)
-
-
 def test_the_next_step_is_what_was_measured():
     data = whole_page()
     rows, names = data.observations, ("a", "b", "c", "d", "e", "f", "g", "h", "i", "j")
@@ -432,16 +409,6 @@ def test_plans_for_fidelity_are_compared_with_equal_levels_at_the_same_views():
     assert composed[:, 1] == pytest.approx([0.955, 0.955])  # the plan for SSIM is not in it
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_blocks_are_merged_for_both_qualities(tmp_path):
-    names = {3: "grass@0", 7: "grass@1", 9: "vase@1"}
-    data = dataclasses.replace(led_by_fidelity(), names=names, categories={3: 3, 7: 3, 9: 9})
-    words = " ".join(Page(write_report(tmp_path, data)).text.split())
-    assert "MB looks like the full model" in words
-    rows = list(csv.DictReader((tmp_path / "tables" / "evaluation.csv").read_text("utf-8").splitlines()))
-    assert sum(row["category"] == "grass" for row in rows) == 3
-
-
 def test_same_data_same_figure(tmp_path):
     data = make(panels=0)
     sizes = {key: 248 * count for key, count in data.counts.items()}
@@ -476,12 +443,6 @@ def test_pixels_that_are_ignored_are_grey_in_the_error_and_explained(tmp_path):
     assert said not in Page(write_report(tmp_path / "all", data)).text
     data = dataclasses.replace(data, panels=[dataclasses.replace(panel, valid=valid)])
     assert said in Page(write_report(tmp_path / "some", data)).text
-
-
-def test_line_colours_are_dark_enough():
-    red, green, blue = figures.ink(3, COLOURS)
-    assert 0.2126 * red**2.2 + 0.7152 * green**2.2 + 0.0722 * blue**2.2 < 0.33
-    assert figures.ink(9, COLOURS) == pytest.approx((90 / 255, 10 / 255, 200 / 255))
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -113,17 +113,9 @@ def test_cameras_without_photos_serve_too(folder: Path, tmp_path: Path) -> None:
     ("names", "options", "words"),
     [
         (("scene.ply", "scene.ply"), {}, r"the splat itself; name another file"),
-        (("scene.ply", "out.txt"), {}, r"out\.txt: its name says no format"),
         (("scene.ply", "lod-meta.json"), {}, r"several levels; name a \.ply"),
-        (("scene.ply", "out.ply"), {"picture": Path("a.jpg")}, r"a\.jpg: pictures are PNG; name it a\.png"),
         (("scene.ply", "out.ply"), {"clean": CleanConfig(floaters="keep")}, r"nothing would be removed"),
-        (
-            ("scene.ply", "out.ply"),
-            {"clean": CleanConfig(max_loss=-1)},
-            r"--clean\.max-loss -1 is imp",
-        ),
         (("scene.ply", None), {}, r"not a run folder; of a splat, name the file to write after it"),
-        (("none.ply", "out.ply"), {}, r"none\.ply: cannot be read"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(folder: Path, names, options: dict, words: str) -> None:

@@ -120,18 +120,9 @@ def test_viewpoints_that_see_nothing_are_one_line(job: Job, tmp_path: Path):
     assert job.run.sampled.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("config", "said"),
-    [
-        (SampleConfig(views=-1), "--sample.views -1 is impossible"),
-        (SampleConfig(shift=2.0), "--sample.shift 2.0 is impossible"),
-        (SampleConfig(viewpoints=Path("nothing.json")), "nothing.json"),
-    ],
-)
-def test_impossible_settings_are_one_line(job: Job, config: SampleConfig, said: str):
-    with pytest.raises(SageError) as caught:
-        again(job, config)
-    assert said in str(caught.value)
+def test_impossible_settings_are_one_line(job: Job):
+    with pytest.raises(SageError, match=r"--sample\.shift 2\.0 is impossible") as caught:
+        again(job, SampleConfig(shift=2.0))
     assert job.run.provenance("sample").exists()  # the earlier result still counts
     assert "\n" not in str(caught.value)
 

@@ -3,14 +3,12 @@
 import json
 import math
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sagesplat import cli
 from sagesplat.core.config import (
     CompareConfig,
     FitConfig,
@@ -270,42 +268,6 @@ def test_a_second_comparison_trains_nothing_and_a_killed_one_goes_on(compared):
     with pytest.raises(RunError, match=r"compare.json: made with other targets .* --force"):
         compare(job, replace(CONFIG, targets=(0.3,), shares=(0.2,)))
     assert not list(folder.glob("pruned-0.2*"))  # it was refused before anything was trained
-
-
-def test_the_command(compared, monkeypatch, capsys, tmp_path):
-    job, _, _ = compared
-    words = ["--targets", "0.3", "0.5", "--snapshots", "3", "--shares", "0.3", "--tune-steps", "5"]
-    words += [
-        "--caps",
-        "0.2",
-        "1",
-        "--budgets",
-        "4",
-        "--lpips",
-        "nowhere",
-        "--json",
-        str(tmp_path / "c.json"),
-    ]
-    monkeypatch.setattr(sys, "argv", ["sagesplat", "compare", str(job.run.path), *words, "--threads", "1"])
-    cli.main()
-    assert "Worst" not in capsys.readouterr().err
-    assert len(read_comparison(tmp_path / "c.json")[0]) > 10
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"shares": (0.1, 1.2)}, "--shares 0.1 1.2 is impossible"),
-        ({"caps": (0.0,)}, "--caps 0.0 is impossible"),
-        ({"caps": (1e-6,)}, "--caps 1e-06 leaves too few"),
-        ({"tune_steps": -2}, "--tune-steps -2 is impossible"),
-        ({"budgets": 1}, "--budgets 1 is impossible"),
-        ({"targets": (1.5,)}, "--targets 1.5 is impossible"),
-    ],
-)
-def test_impossible_settings_are_refused(finished, change, says):
-    with pytest.raises(RunError, match=says):
-        compare(finished, replace(CONFIG, **change))
 
 
 def test_runs_that_cannot_be_compared_are_refused(finished, tmp_path):

@@ -15,15 +15,12 @@ from test_cli import call
 
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
-from sagesplat.cli import commands
-from sagesplat.cli.parse import arguments
 from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import DataError, RunError, SageError
 from sagesplat.core.events import Event, TableMade, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_increments, read_index, shown
 from sagesplat.formats.ply import write_ply
-from sagesplat.formats.spz import encode_spz
 from sagesplat.metrics.image import psnr, ssim_map
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
@@ -123,14 +120,6 @@ def test_viewpoints_are_drawn_where_none_are_given(files):
     assert lines[0].startswith("object: as asked")
 
 
-def test_fewer_viewpoints_of_a_file_and_smaller_images(files):
-    found = measure(
-        [files / "full.ply", files / "third.ply"], files / "out", settings(files, views=2, size=24), ignore
-    )
-    assert found.views == ["000", "002"]
-    assert found.of(0, TOTAL)[0].pixels == 24 * 16
-
-
 def put_streamed(folder: Path) -> Path:
     for level in ("0", "1"):
         put_sog(folder / f"{level}_0", *sog(6, 0))
@@ -209,11 +198,6 @@ def test_what_is_left_out_is_told(files):
     ]
 
 
-def test_one_level_alone(files):
-    with pytest.raises(RunError, match=r"full\.ply: one level, and nothing to compare it with; name its"):
-        measure([files / "full.ply"], files / "out", settings(files), ignore)
-
-
 def test_cameras_of_another_scene(files):
     away = [
         replace(camera, w2c=camera.w2c @ np.diag([-1, 1, -1, 1]).astype(np.float32)) for camera in orbit(2)
@@ -229,40 +213,16 @@ def test_the_command(files, monkeypatch, capsys):
     weights = ["--lpips", "none", "--threads", "1"]
     code, _ = call(monkeypatch, capsys, "measure", "full.ply", "nowhere.ply", *weights)
     assert code == 2
-    code, _ = call(
-        monkeypatch,
-        capsys,
-        "measure",
-        "full.ply",
-        "third.ply",
-        "same.ply",
-        "--cameras",
-        "views.json",
-        *weights,
-    )
+    words = ["full.ply", "third.ply", "same.ply", "--cameras", "views.json", *weights]
+    code, _ = call(monkeypatch, capsys, "measure", *words)
     assert code == 0
     assert (files / "measure" / "levels.csv").is_file()
 
 
-@pytest.mark.parametrize("words", [["--up", "-z"], ["--up=-z"], ["--up", "z"]])
-def test_a_direction_with_a_minus_is_a_value(words):
-    values = arguments("measure", commands()["measure"], ["a.ply", "b.ply", *words])
-    assert values["measure"].up == words[-1].removeprefix("--up=")
-    assert values["levels"] == (Path("b.ply"),)
-
-
-@pytest.mark.parametrize("wrong", [{"views": 0}, {"size": 3}, {"size": 10**6}])
-def test_impossible_settings(files, wrong):
-    with pytest.raises(RunError, match="choose"):
-        measure([files / "full.ply", files / "third.ply"], files / "out", settings(files, **wrong), ignore)
-    assert not (files / "out").exists()
-
-
 def test_files_that_are_none(files):
-    for name, content in (("empty.ply", b""), ("text.spz", b"hello"), ("cut.spz", encode_spz(FULL)[:90])):
-        (files / name).write_bytes(content)
-        with pytest.raises(DataError, match=name):
-            measure([files / "full.ply", files / name], files / "out", settings(files), ignore)
+    (files / "text.spz").write_bytes(b"hello")
+    with pytest.raises(DataError, match=r"text\.spz"):
+        measure([files / "full.ply", files / "text.spz"], files / "out", settings(files), ignore)
     with pytest.raises(SageError, match="nowhere"):
         measure([files / "full.ply", files / "nowhere.ply"], files / "out", settings(files), ignore)
     with pytest.raises(DataError, match="cannot be read"):
@@ -276,11 +236,8 @@ LABEL = {"id": 3, "title": "car", "levels": [CHUNK]}
 @pytest.mark.parametrize(
     "labels",
     [
-        *(4, None, "x", [4], [{}], [LABEL | {"id": "x"}], [LABEL | {"id": [1]}], [LABEL | {"title": 4}]),
-        *([LABEL | {"levels": value}] for value in (3, [4], [{}], [[]], {"a": 1})),
-        *([LABEL | {"levels": [CHUNK | {"uri": uri}]}] for uri in (3, "a.spz", "chunks/../a", "/etc/passwd")),
-        *([LABEL | {"levels": [CHUNK | {key: -1}]}] for key in ("count", "bytes", "sha256", "refine")),
-        [],
+        *(4, [], [LABEL | {"id": "x"}], [LABEL | {"levels": [4]}]),
+        *([LABEL | {"levels": [CHUNK | change]}] for change in ({"uri": "chunks/../a"}, {"count": -1})),
     ],
 )
 def test_damaged_bundles_are_one_line(tmp_path, labels):

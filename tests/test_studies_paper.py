@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import pinhole, random_gaussians
-from PIL import Image
 
 from sagesplat.adapt.ladder import read_ladder
 from sagesplat.adapt.observe import TOTAL, RenderedLabels, near_border, read_observations
@@ -18,7 +17,6 @@ from sagesplat.core.config import (
     PlanConfig,
     RunConfig,
     SampleConfig,
-    SceneConfig,
     TrainConfig,
 )
 from sagesplat.core.errors import RunError
@@ -26,7 +24,7 @@ from sagesplat.core.events import Event, StageSkipped, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.formats.levels import write_level
 from sagesplat.formats.ply import read_ply
-from sagesplat.io.files import read_json, write_json
+from sagesplat.io.files import read_json
 from sagesplat.output import tables
 from sagesplat.output.table import Table
 from sagesplat.run.job import Job
@@ -39,7 +37,6 @@ from sagesplat.stages.export import export_scene
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.observe import observe_levels
-from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
@@ -211,65 +208,6 @@ def test_a_second_report_has_nothing_to_do_and_another_view_needs_force(finished
         paper_report(again, replace(PAPER, view="nothing"))
     with pytest.raises(RunError, match=r"same_size\.csv: made with other .*--force"):
         paper_report(again, replace(PAPER, lpips=job.run.path / "nowhere", view=job.scene.views[3].name))
-
-
-@pytest.mark.slow
-def test_a_capture_without_test_views(capture, tmp_path):
-    config = replace(CONFIG, scene=SceneConfig(test_every=0), train=TrainConfig(max_steps=20, level_every=10))
-    job, _ = work(tmp_path / "run", capture, config)
-    paper_report(job, replace(PAPER, lpips=tmp_path, tune_steps=0))
-    assert not (job.run.paper / "table_1_test.csv").exists()
-    assert not (job.run.paper / "cross_view.csv").exists()
-    assert set(read_same_size(job.run.same_size).of_view) == {6}
-
-
-@pytest.mark.slow
-def test_categories_that_hardly_occur(capture, tmp_path):
-    """One in two training views only, one of a single pixel, one in test views only."""
-    folder = tmp_path / "capture"
-    shutil.copytree(capture, folder)
-    names = read_json(folder / "masks" / "labels.json")
-    names["labels"] |= {"150": "ghost", "151": "speck", "152": "stranger"}
-    write_json(folder / "masks" / "labels.json", names)
-    where = {150: ((1, 3), np.s_[20:50, 20:60]), 151: ((2,), np.s_[30:31, 30:31]), 152: ((0, 8), np.s_[:30])}
-    for value, (views, pixels) in where.items():
-        for view in views:
-            path = folder / "masks" / f"view_{view:03d}.png"
-            mask = np.array(Image.open(path))
-            mask[pixels] = value
-            Image.fromarray(mask).save(path)
-    config = replace(CONFIG, train=TrainConfig(max_steps=30, level_every=10, freeze_at=0.9))
-    events: list[Event] = []
-    job = Job(RunDir(tmp_path / "run", "snapshots"), events.append)
-    run_all(job, folder, config)
-    paper_report(job, replace(PAPER, lpips=tmp_path))
-    seen = read_observations(job.run.observations)
-    assert {150, 151, 152} <= set(seen.label_id)
-    assert set(seen.view[seen.label_id == 152]) == {0, 8}
-    assert (seen.num_pixels[seen.label_id == 151] == 1).all()
-    models = read_json(job.run.models)["models"]
-    assert {m["status"] for m in models if m["label_id"] == 150} == {"constant"}
-    assert not [m for m in models if m["label_id"] == 152]  # nothing to fit
-    assert (job.run.paper / "paper.md").exists()
-
-
-@pytest.mark.parametrize("target", [0.0, 1.5, float("nan"), -0.2])
-def test_impossible_targets_are_refused_before_training(capture, tmp_path, target):
-    job = Job(RunDir(tmp_path / "run", "snapshots"), lambda event: None)
-    with pytest.raises(RunError, match=r"target SSIM .* is impossible"):
-        run_all(job, capture, replace(CONFIG, plan=PlanConfig(target_ssim=target)))
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_a_target_of_one_is_a_plan_out_of_reach(finished, tmp_path):
-    job, _ = finished
-    folder = tmp_path / "run"
-    shutil.copytree(job.run.path, folder)
-    other = Job(RunDir(folder, "snapshots"), lambda event: None, force=True)
-    make_plan(other, PlanConfig(target_ssim=1.0))
-    paper_report(other, replace(PAPER, lpips=tmp_path, tune_steps=0))
-    assert "; t=1: " in (other.run.paper / "table_3_view.md").read_text()
 
 
 def test_tuned_compositions_are_the_same_set_made_better(finished, tmp_path):
