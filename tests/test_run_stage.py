@@ -160,7 +160,7 @@ class Watch:
         self._check(one, mine, read)
         if not self.at_work:
             others = [set()]  # of the next one: it reads before it is a stage
-            for name in ("_opened", "_refined", "photos", "masks", "recorded", "ladder", "antialiased"):
+            for name in ("_opened", "given_scene", "_refined", "photos", "masks", "recorded", "ladder", "antialiased"):
                 vars(job).pop(name, None)  # else only the first stage would read them
         _reading.extend(others)
 

@@ -97,10 +97,10 @@ class Job:
             self._refined = state, with_cameras(given, read_refined(path, len(given.views)))
         return self._refined[1]
 
-    @property
+    @cached_property
     def given_scene(self) -> Scene:
         """The capture that scene.json names, unchanged since, with its cameras as they were given."""
-        return self._opened[0]
+        return self.source.given_scene if self.source else self._opened[0]
 
     @cached_property
     def photos(self) -> Photos:

@@ -156,7 +156,7 @@ def _in_streams(listed: Sequence[Increment]) -> bool:
 def _without_capture(job: Job) -> Job:
     """The job with the cameras and points that the run kept: its capture may be gone or changed since."""
     source = replace(job)
-    vars(source)["given_scene"] = read_scene(job.run.geometry)
+    source.given_scene = read_scene(job.run.geometry)
     return replace(job, source=source)
 
 
