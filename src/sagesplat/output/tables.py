@@ -16,6 +16,7 @@ from sagesplat.output.table import Table
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_NAME
 
 MB = 1e6  # bytes
+_COLUMNS = 4  # of a ladder in a terminal
 
 
 @dataclass(frozen=True)
@@ -88,12 +89,12 @@ def counts_table(counts: Counts, labels: Sequence[int], names: Mapping[int, str]
 
 
 def ladder_table(
-    rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str], columns: int = 4
+    rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str]
 ) -> Table:
     """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some levels."""
     levels = sorted({level for _, level in counts})
     not_recovering = [level for level in levels if level not in recovering] or levels
-    spread = np.linspace(0, len(not_recovering) - 1, columns).round().astype(int)
+    spread = np.linspace(0, len(not_recovering) - 1, _COLUMNS).round().astype(int)
     picked = sorted({not_recovering[i] for i in spread})
     body = []
     for label_id in [*by_size(counts), TOTAL]:

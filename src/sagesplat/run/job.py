@@ -120,10 +120,9 @@ class Job:
             raise RunError(
                 f"{made.path}: the capture changed since this run began; choose another run folder"
             )
-        if made.photos is not None:
-            now = photo_hashes(self.run.photo_hashes, scene)
-            check_photos(scene, made.photos, now.sha256)
-            now.keep()
+        now = photo_hashes(self.run.photo_hashes, scene)
+        check_photos(scene, made.photos, now.sha256)
+        now.keep()
         return scene, Photos(scene.views, memory.photo_cache(self.memory_limit))
 
     @property

@@ -17,16 +17,7 @@ from sagesplat.stages.results import budget_plan_of, evaluation_of
 
 
 def make_report(job: Job, url: str = "") -> None:
-    """Write the report.
-
-    Args:
-        job: The run folder, and where events go.
-        url: Address at which the run's bundle was published: the page links to it, with a QR code.
-
-    Raises:
-        RunError: For an address that is none of http or https, or results that are missing or do not belong
-            together.
-    """
+    """Write the report; it links to `url`, where the run's bundle was published, with a QR code."""
     # loads matplotlib, for which no training has to wait
     from sagesplat.output.report import write_report
     from sagesplat.stages.report_data import links, report_data, stage_records

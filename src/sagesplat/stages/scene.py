@@ -85,9 +85,8 @@ def open_scene(
     scene = begun.load() if begun and again else load_scene(path, **asdict(config))
     photos, found = photo_hashes(run.photo_hashes, scene), scene.views[0].vignetting
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
-    if begun is None or begun.photos is not None or begun.fingerprint != settings["fingerprint"]:
-        settings["photos"] = photos.digest
-    if begun and same and begun.photos is not None:
+    settings["photos"] = photos.digest
+    if begun and same:
         check_photos(scene, begun.photos, photos.sha256)
 
     def make() -> list[str]:
@@ -126,8 +125,6 @@ def open_scene(
 
     run_stage(job, "scene", settings, [], [run.scene], make)
     photos.keep()
-    if not run.geometry.exists():  # the run began before it was kept
-        _write_geometry(run.geometry, scene)
 
 
 def _downscale(job: Job, path: Path, begun: Capture | None) -> int:
