@@ -160,7 +160,8 @@ class Watch:
         self._check(one, mine, read)
         if not self.at_work:
             others = [set()]  # of the next one: it reads before it is a stage
-            for name in ("_opened", "given_scene", "_refined", "photos", "masks", "recorded", "ladder", "antialiased"):
+            scene = ("_opened", "given_scene", "_refined", "photos")
+            for name in (*scene, "masks", "recorded", "ladder", "antialiased"):
                 vars(job).pop(name, None)  # else only the first stage would read them
         _reading.extend(others)
 

@@ -232,16 +232,6 @@ def test_a_category_that_nothing_shows_is_unlabelled_and_said(tmp_path: Path) ->
     assert any("5 Gaussians" in str(event) for event in events if isinstance(event, Warned))
 
 
-def test_what_cannot_be_drawn_is_left_out_and_said(tmp_path: Path) -> None:
-    g = _ball()
-    broken = g.means.clone()
-    broken[:7] = float("nan")
-    write_ply(tmp_path / "ball.ply", replace(g, means=broken), {3: "car", 184: "tree-merged"})
-    job, events = _levels(tmp_path, tmp_path / "ball.ply", replace(SMALL, shares=(1.0,)))
-    assert job.ladder.size(1) == len(g) - 7
-    assert any("7 Gaussians left out" in str(event) for event in events if isinstance(event, Warned))
-
-
 def test_one_gaussian(tmp_path: Path) -> None:
     g = random_gaussians(1, degree=0, log_scale=-0.5, logit=3.0)
     write_ply(tmp_path / "few.ply", replace(g, label_ids=torch.full_like(g.label_ids, -1)))

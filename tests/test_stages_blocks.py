@@ -441,7 +441,7 @@ def test_stored_scenes_name_photos_that_may_be(tmp_path: Path) -> None:
     scene = write_capture(tmp_path / "capture", random_gaussians(12))
     views = (replace(scene.views[0], name="caf\udce9.png"), *scene.views[1:])
     write_scene(tmp_path / "a.npz", replace(scene, views=views))
-    with pytest.raises(SceneError, match=r"not a stored scene \(it is not UTF-8"):
+    with pytest.raises(SceneError, match=r"not a stored scene \(views\[0\]: it is not UTF-8"):
         read_scene(tmp_path / "a.npz")
     write_scene(tmp_path / "b.npz", replace(scene, name="\x1b[31m"))
     assert read_scene(tmp_path / "b.npz").name == "_[31m"

@@ -31,7 +31,7 @@ from sagesplat.scene.scene import Points, Scene, View
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.compose import compose_plan
 from sagesplat.stages.evaluate import evaluate_plans
-from sagesplat.stages.export import export_increments, export_scene
+from sagesplat.stages.export import export_scene
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
@@ -390,15 +390,6 @@ def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: 
         make_plan(job, PlanConfig(target_ssim=0.4, budget=1e5, weights={"nothing": 5.0}))
 
 
-def test_all_infeasible_is_a_plan_with_a_status(finished: Path, tmp_path: Path) -> None:
-    shutil.copytree(finished, tmp_path / "run")
-    job = quiet(tmp_path / "run", force=True)
-    make_plan(job, PlanConfig(target_ssim=1.0))
-    plans, _ = read_plans(job.run.plan)
-    assert plans[-1].status == "infeasible"
-    assert {c.status for c in plans[-1].choices} <= {"infeasible", "no model"}
-
-
 def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "run")
     job = quiet(tmp_path / "run")
@@ -467,21 +458,6 @@ def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -
     worth = importance(g, scene, scene.train_ids.tolist(), "sensitivity")
     worthiest = g.means[torch.from_numpy(np.argsort(-worth, kind="stable")[:42].copy())]
     assert torch.equal(found.gaussians.means[8:], worthiest)
-
-
-def test_chunks_are_exported_as_files(finished: Path, tmp_path: Path) -> None:
-    job = quiet(finished)
-    for kind in ("spz", "ply"):
-        count = export_increments(job, tmp_path / kind, kind)
-        chunks = read_index(tmp_path / kind)
-        assert count == len(chunks) == len(list((tmp_path / kind).glob(f"*.{kind}")))
-        assert sum(c.count for c in chunks) == len(job.ladder.load(5))
-    counts = [[c.count for c in read_index(folder)] for folder in (tmp_path / "ply", job.run.increments)]
-    assert counts[0] == counts[1]
-    with pytest.raises(RunError, match="exists"):
-        export_increments(job, tmp_path / "ply", "ply")
-    with pytest.raises(RunError, match="these levels have no chunks"):
-        export_increments(Job(RunDir(finished, "snapshots"), print), tmp_path / "none", "ply")
 
 
 def test_export_writes_what_other_viewers_read(finished: Path, tmp_path: Path) -> None:

@@ -157,10 +157,9 @@ def test_a_comparison_reads_back_and_damage_is_one_line(tmp_path):
     again, same = read_comparison(tmp_path / "c.json")
     assert repr(again) == repr(points)
     assert same == walks
-    for broken in ({"points": 3}, {"points": [{}], "walks": []}, {"points": [], "walks": [{"x": 1}]}, []):
-        write_json(tmp_path / "c.json", broken)
-        with pytest.raises(DataError, match=r"c.json: not a comparison .* compare again"):
-            read_comparison(tmp_path / "c.json")
+    write_json(tmp_path / "c.json", {"points": [{}], "walks": []})
+    with pytest.raises(DataError, match=r"c.json: not a comparison .* compare again"):
+        read_comparison(tmp_path / "c.json")
 
 
 @pytest.fixture(scope="module")
@@ -237,19 +236,6 @@ def test_mcmc_keeps_its_cap_even_below_the_number_of_points(compared):
         assert 0.8 * share * full < len(g) <= round(share * full)
 
 
-def test_a_random_subset_of_the_points_keeps_labels_and_tracks(finished):
-    scene, labels = finished.scene, finished.point_labels
-    few, mine = with_at_most(scene, labels, 100, 3)
-    assert len(few.points.xyz) == len(few.points.rgb) == len(mine) == 100
-    rows = [int(np.flatnonzero((scene.points.xyz == xyz).all(1))[0]) for xyz in few.points.xyz]
-    np.testing.assert_array_equal(mine, labels[rows])
-    kept = np.isin(scene.points.track_points, rows)
-    np.testing.assert_array_equal(np.array(rows)[few.points.track_points], scene.points.track_points[kept])
-    np.testing.assert_array_equal(few.points.track_uv, scene.points.track_uv[kept])
-    np.testing.assert_array_equal(with_at_most(scene, labels, 100, 3)[1], mine)
-    assert with_at_most(scene, labels, 10**6, 3)[0] is scene
-
-
 def test_a_second_comparison_trains_nothing_and_a_killed_one_goes_on(compared):
     job, _, _ = compared
     events: list[Event] = []
@@ -280,10 +266,16 @@ def test_runs_that_cannot_be_compared_are_refused(finished, tmp_path):
     (folder / "nested" / "promises.json").unlink()
     with pytest.raises(RunError, match=r"promises.json: missing.* finish `sagesplat run`"):
         compare(Job(RunDir(folder), lambda event: None), CONFIG)
-    shutil.rmtree(folder / "nested")
-    with pytest.raises(RunError, match=r"ladder.npz: missing"):
-        compare(Job(RunDir(folder), lambda event: None), CONFIG)
-    made = read_json(folder / "scene.json")
-    write_json(folder / "scene.json", {**made, "settings": {**made["settings"], "test_every": 0}})
-    with pytest.raises(RunError, match=r"no test views to compare on"):
-        compare(Job(RunDir(folder), lambda event: None), CONFIG)
+
+
+def test_a_random_subset_of_the_points_keeps_labels_and_tracks(finished):
+    scene, labels = finished.scene, finished.point_labels
+    few, mine = with_at_most(scene, labels, 100, 3)
+    assert len(few.points.xyz) == len(few.points.rgb) == len(mine) == 100
+    rows = [int(np.flatnonzero((scene.points.xyz == xyz).all(1))[0]) for xyz in few.points.xyz]
+    np.testing.assert_array_equal(mine, labels[rows])
+    kept = np.isin(scene.points.track_points, rows)
+    np.testing.assert_array_equal(np.array(rows)[few.points.track_points], scene.points.track_points[kept])
+    np.testing.assert_array_equal(few.points.track_uv, scene.points.track_uv[kept])
+    np.testing.assert_array_equal(with_at_most(scene, labels, 100, 3)[1], mine)
+    assert with_at_most(scene, labels, 10**6, 3)[0] is scene

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from test_cli import call
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
 from sagesplat.core.config import MeasureConfig
-from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, TableMade, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_increments, read_index, shown
@@ -27,7 +26,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import bundle
 from sagesplat.studies.measure import score
-from sagesplat.studies.measure.levels import levels_of, stored_bytes, unique_names
+from sagesplat.studies.measure.levels import levels_of
 from sagesplat.studies.measure.report import levels_table
 from sagesplat.studies.measure.run import measure
 from sagesplat.studies.measure.score import COVERED
@@ -178,26 +177,6 @@ def test_levels_that_do_not_fit_into_memory_together(files, monkeypatch):
     assert together.of(1, TOTAL) == alone.of(1, TOTAL)
 
 
-def test_files_of_one_name_are_told_apart(files):
-    for folder in ("a", "b"):
-        (files / folder).mkdir()
-        shutil.copy(files / "third.ply", files / folder / "x.ply")
-    paths = [files / "a" / "x.ply", files / "b" / "x.ply", files / "a" / "x.ply"]
-    found = [levels_of(path)[0] for path in paths]
-    assert unique_names(found, paths) == ["a/x.ply (1)", "b/x.ply", "a/x.ply (2)"]
-
-
-def test_what_is_left_out_is_told(files):
-    bad = FULL.means.clone()
-    bad[0] = float("nan")
-    write_ply(files / "bad.ply", replace(FULL, means=bad))
-    events: list[Event] = []
-    measure([files / "bad.ply", files / "third.ply"], files / "out", settings(files), events.append)
-    assert "bad.ply: Gaussians left out: 1 NaN or infinite" in [
-        event.text for event in events if isinstance(event, Warned)
-    ]
-
-
 def test_cameras_of_another_scene(files):
     away = [
         replace(camera, w2c=camera.w2c @ np.diag([-1, 1, -1, 1]).astype(np.float32)) for camera in orbit(2)
@@ -217,16 +196,6 @@ def test_the_command(files, monkeypatch, capsys):
     code, _ = call(monkeypatch, capsys, "measure", *words)
     assert code == 0
     assert (files / "measure" / "levels.csv").is_file()
-
-
-def test_files_that_are_none(files):
-    (files / "text.spz").write_bytes(b"hello")
-    with pytest.raises(DataError, match=r"text\.spz"):
-        measure([files / "full.ply", files / "text.spz"], files / "out", settings(files), ignore)
-    with pytest.raises(SageError, match="nowhere"):
-        measure([files / "full.ply", files / "nowhere.ply"], files / "out", settings(files), ignore)
-    with pytest.raises(DataError, match="cannot be read"):
-        stored_bytes(files / "nowhere.ply")
 
 
 CHUNK = {"uri": "chunks/a.spz", "count": 3, "bytes": 9, "gpuBytes": 9, "sha256": "0" * 64}

@@ -185,17 +185,6 @@ def test_levels_that_another_runs_models_choose_for_a_view():
         assert levels == {7: own[7]}  # `else` is not shared
 
 
-def test_what_is_not_known_is_predicted_by_the_median():
-    b = replace(A, extent=math.nan, spacings={1: 0.01})
-    scores = transfer(A, b, [0.7])
-    blind = np.isin(scores.predictor, ["extent", "median"]) | (
-        (scores.predictor == "footprint") & (scores.category == "bench")
-    )
-    assert (scores.outside == np.where(blind, 1.0, 0.0)).all()
-    assert (scores.ssim_error[blind] > 0.05).all()
-    assert (scores.ssim_error[~blind] < 1e-6).all()
-
-
 def test_scores_by_hand():
     """Three levels in four views: kept too dear, missed, kept at best, and out of reach of every level."""
     levels, counts = np.array([100, 200, 300]), np.array([10, 40, 30])
@@ -290,15 +279,3 @@ def test_runs_that_were_measured_differently(job, tmp_path):
         transfer_runs(job, other, tmp_path / "out")
     record(other.run, "fit", {"min_share": 0.0, "region": "eroded"}, [], 0.0)
     assert (load_fitted(other).observations.ssim == 1.0).all()  # the other column
-
-
-def test_runs_that_are_not_ready_are_one_line(job, tmp_path):
-    with pytest.raises(RunError, match="nowhere: not a run folder"):
-        transfer_runs(Job(RunDir(tmp_path / "nowhere", "snapshots"), print), job, tmp_path / "out", [0.5])
-    hidden = job.run.models.rename(tmp_path / "models.json")
-    try:
-        with pytest.raises(RunError, match=r"models\.json: missing; finish"):
-            transfer_runs(Job(job.run, print), job, tmp_path / "out", [0.5])
-    finally:
-        hidden.rename(job.run.models)
-    assert not (tmp_path / "out").exists()

@@ -128,14 +128,14 @@ def error_image(
 
 def panel_grid(
     count: int, columns: int, cell: tuple[float, float], beside: float, **shared: Any
-) -> tuple[Figure, Sequence[Axes]]:
+) -> tuple[Figure, list[Axes]]:
     """A figure with `count` panels, line by line; `cell`: inches of one, `beside`: height of all else."""
     lines = max(1, math.ceil(count / columns))
     figure = Figure(figsize=(cell[0] * columns, cell[1] * lines + beside), layout="constrained")
     grid = figure.subplots(lines, columns, squeeze=False, **shared).ravel()
     for axes in grid[count:]:
         axes.set_axis_off()
-    return figure, grid[:count]
+    return figure, list(grid[:count])
 
 
 @rc_context(STYLE)
