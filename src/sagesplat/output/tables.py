@@ -141,15 +141,8 @@ def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
     for choice in sorted(plan.choices, key=lambda c: -full.get(c.label_id, 0)):
         share = choice.count / full[choice.label_id] if full.get(choice.label_id) else math.nan
         sent = math.nan if choice.transfer_bytes is None else choice.transfer_bytes / MB
-        cells = (
-            choice.level,
-            choice.count,
-            share,
-            sent,
-            choice.nbytes / MB,
-            choice.distance,
-            choice.predicted,
-        )
+        cells = (choice.level, choice.count, share, sent, choice.nbytes / MB)
+        cells += (choice.distance, choice.predicted)
         of = choice.reached
         views = (of.share, of.low, of.high, of.num_views) if of else (math.nan,) * 4
         body.append((name_of(choice.label_id, names), *cells, *views, choice.verdict))
