@@ -184,21 +184,6 @@ def test_without_test_views_and_pictures(tmp_path):
     assert not (tmp_path / "figures" / "quality_over_size.svg").exists()
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_categories_out_of_reach_are_named(tmp_path):
-    data = make(panels=0)
-    distances = {i: np.array([2.0]) for i in LABELS}
-    plan = plan_scene(data.models, data.counts, distances, 0.75)
-    out = [c.label_id for c in plan.choices if c.status == "infeasible"]
-    assert 0 < len(out) < len(LABELS)
-    data = dataclasses.replace(
-        data, plans=[plan], target=0.75, observations=data.observations.select(TEST[:0])
-    )
-    text = " ".join(Page(write_report(tmp_path, data)).text.split())
-    assert f"{len(out)} of {len(LABELS)} categories cannot reach 0.75" in text
-    assert text.count("infeasible") > len(out)
-
-
 def led_by_fidelity(panels: int = 0) -> ReportData:
     """The same capture with nested levels: plans for fidelity, one for SSIM beside them."""
     data = make(panels)

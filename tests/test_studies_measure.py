@@ -1,6 +1,5 @@
 """Levels of anybody against their scene: files, streamed SOG, bundles and runs; tables, picture and files."""
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import orbit, random_gaussians
-from PIL import Image
 from test_cli import call
 
 from sagesplat.adapt.observe import TOTAL
@@ -78,27 +76,6 @@ def test_files_against_a_file(files):
     titles = [event.title for event in events if isinstance(event, TableMade)]
     assert titles == ["Levels against full.ply, means over 3 viewpoints", "SSIM by category"]
     assert [e.text[:15] for e in events if isinstance(e, Warned)] == ["no LPIPS (alex)", "no LPIPS (vgg):"]
-
-
-def test_what_is_written(files):
-    paths = [files / name for name in ("full.ply", "same.ply", "third.ply")]
-    measure(paths, files / "out", settings(files), ignore)
-    out = files / "out"
-    assert {p.name for p in out.iterdir()} == {
-        *("levels.csv", "views.csv", "measure.json", "measure.png", "measure.svg", "viewpoints.png"),
-    }
-    rows = list(csv.DictReader((out / "views.csv").read_text().splitlines()))
-    assert len(rows) == 2 * VIEWS * 4  # whole image, covered, two categories
-    assert {row["viewpoint"] for row in rows} == {"000", "001", "002"}
-    document = json.loads((out / "measure.json").read_text())
-    assert document["reference"] == {"name": "full.ply", "Gaussians": 150}
-    assert document["viewpoints"] == ["3 of the 3 cameras of views.json"]
-    assert [(one["level"], one["region"]) for one in document["levels"]][:2] == [
-        ("same.ply", "whole image"),
-        ("same.ply", "covered by the reference"),
-    ]
-    with Image.open(out / "measure.png") as picture:
-        assert picture.size[0] > 1000
 
 
 def test_an_empty_background_does_not_count_as_covered(files):

@@ -24,7 +24,6 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.scene import open_scene
-from sagesplat.studies.transfer.report import headline, summary_table, transfer_figure
 from sagesplat.studies.transfer.run import load_fitted
 from sagesplat.studies.transfer.run import transfer as transfer_runs
 from sagesplat.studies.transfer.score import (
@@ -152,26 +151,6 @@ def test_levels_are_matched_by_their_share_of_the_run():
     resetting = replace(A, recovering=frozenset({200}))  # 90 of 150 is nearer to 300 of 300 than to 100
     assert shared_categories(resetting, b)[0].matched == (100, 100, 300)
     assert shared_categories(replace(A, recovering=frozenset(LEVELS)), b)[0].matched == (100, 200, 300)
-
-
-def test_a_category_without_test_views_and_one_in_two_views():
-    rows = A.observations
-    no_test = A.test_views[:, None] == rows.view
-    few = np.isin(rows.view, (0, 3))
-    b = replace(A, observations=rows.select(np.where(rows.label_id == 1, ~no_test.any(0), few)))
-    scores = transfer(A, b, [0.7])
-    apple, bench = (
-        scores.select((scores.category == n) & (scores.predictor == "raw")) for n in ("apple", "bench")
-    )
-    assert (apple.views.tolist(), bench.views.tolist()) == ([14, 0], [1, 1])
-    assert np.isfinite(apple.ssim_error[0] + bench.ssim_error).all()
-    for name in ("ssim_error", "bias", "outside", "iteration_error", "hit", "regret", "regret_share"):
-        assert math.isnan(getattr(apple, name)[1])
-    assert (apple.reachable[1], apple.missed[1]) == (0, 0)
-    assert "on test views" in headline(summary_table(scores))
-    alone = replace(b, test_views=b.test_views[:0])
-    assert "on train views" in headline(summary_table(transfer(A, alone, [0.7])))
-    transfer_figure(A, b)
 
 
 def test_levels_that_another_runs_models_choose_for_a_view():
