@@ -116,7 +116,7 @@ def open_scene(
             lines.append(_of_lens(found))
         return lines
 
-    run_stage(job, "scene", settings, [], [run.scene], make)
+    run_stage(job, "scene", settings, [], [run.scene, run.geometry], make)
     photos.keep()
 
 
