@@ -25,8 +25,8 @@ POSES = {
 }  # fmt: skip
 EXPOSURE = {"range_ev": 0.84, "psnr": None, "ssim": None}
 FLOATERS = {
-    "gaussians": 9000, "found": {"few views": 300, "in front": 1300, "category": 40},
-    "removed": {"few views": 300, "in front": 1200, "category": 40},
+    "gaussians": 9000, "found": {"hardly shown": 300, "in front": 1300, "category": 40},
+    "removed": {"hardly shown": 300, "in front": 1200, "category": 40},
     "before": {"train": 20.0}, "after": {"train": 20.0},
 }  # fmt: skip
 WORDS = (

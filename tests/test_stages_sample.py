@@ -79,7 +79,7 @@ def test_done_once_and_again_with_other_settings(job: Job):
     assert [e.name for e in first if isinstance(e, StageDone)] == ["sample"]
     drawn = job.run.viewpoints.read_bytes()
     assert [e.name for e in again(job) if isinstance(e, StageSkipped)] == ["sample"]
-    again(job, replace(FEW, seed=1))
+    again(job, replace(FEW, shift=0.2))
     assert job.run.viewpoints.read_bytes() != drawn
     again(job, FEW)
     assert job.run.viewpoints.read_bytes() == drawn

@@ -108,7 +108,8 @@ def bundling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bundling:
     fake, package = Bundling(), tmp_path / "package"
     fake.viewer = {"index.html": b"one <!-- poster -->"}
     write_files(package / "viewer" / "static", fake.viewer)
-    monkeypatch.setitem(sys.modules, "sagesplat.stages.bundle", fake)
+    for name in ("bundle", "live_bundle"):
+        monkeypatch.setitem(sys.modules, f"sagesplat.stages.{name}", fake)
     built = package / "viewer" / "static"
     monkeypatch.setattr(stages_view, "package_viewer", lambda: built)
     monkeypatch.setattr(site, "package_viewer", lambda: built)
