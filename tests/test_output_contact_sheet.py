@@ -12,7 +12,7 @@ from sagesplat.output.contact_sheet import MOST, contact_sheet
 UP = np.array([0.0, -1.0, 0.0])
 
 
-@pytest.mark.parametrize("views", [1, 3, 14, MOST + 5])
+@pytest.mark.parametrize("views", [1, MOST + 5])
 def test_a_picture_of_each_viewpoint_and_two_maps(tmp_path, views):
     contact_sheet(tmp_path / "v.png", random_gaussians(60), orbit(views), UP, ["scene", "why"])
     pixels = np.asarray(Image.open(tmp_path / "v.png").convert("RGB"))

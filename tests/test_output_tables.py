@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sagesplat.adapt.eq3 import fit_model
 from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Plan, Reached
@@ -47,14 +46,6 @@ def as_text(table: tables.Table, path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_last_level_is_the_full_model():
-    assert tables.last_counts(COUNTS) == {3: 40, 7: 60, -1: 5}
-    assert tables.by_size(COUNTS) == LABELS
-    assert [tables.name_of(i, NAMES) for i in (7, -1, TOTAL, 9)] == [
-        "dining, table", "unlabelled", "whole image", "category 9",
-    ]  # fmt: skip
-
-
 def test_quality_averages_the_views_asked_for(tmp_path):
     table = tables.quality_table(observe(), np.array([0, 2]), LABELS, NAMES, "training")
     rows = as_text(table, tmp_path / "t.csv")
@@ -63,12 +54,6 @@ def test_quality_averages_the_views_asked_for(tmp_path):
     assert float(rows[1]["whole image"]) == pytest.approx(0.61)
     assert rows[0]["unlabelled"] == ""
     assert table.cells()[0] == ["1,000", "0.610", "0.710", "0.510", "–"]
-
-
-def test_counts_add_up(tmp_path):
-    rows = as_text(tables.counts_table(COUNTS, LABELS, NAMES), tmp_path / "t.csv")
-    assert [int(row["all"]) for row in rows] == [65, 105]
-    assert [int(row["vase"]) for row in rows] == [10, 40]
 
 
 def test_plan_and_targets(tmp_path):
@@ -155,16 +140,6 @@ def test_plans_of_both_qualities_side_by_side(tmp_path):
         tables.targets_table([plan, replace(plan, quality="ssim")], COUNTS, LABELS, NAMES), tmp_path / "t"
     )
     assert {"fidelity 0.8 status", "SSIM 0.8 status"} < set(two[0])
-
-
-def test_models_table(tmp_path):
-    distance = np.linspace(1, 5, 30, dtype=np.float32)
-    model = fit_model(3, 1000, distance, 0.8 * np.exp(-0.1 * distance))
-    row = as_text(tables.models_table({(3, 1000): model}, NAMES), tmp_path / "t.csv")[0]
-    assert row["category"] == "vase"
-    assert float(row["K1"]) == model.params.K1
-    assert (float(row["d min"]), float(row["d max"])) == (1, 5)
-    assert tables.models_table({}, NAMES).rows == []
 
 
 AWKWARD = (

@@ -12,9 +12,8 @@ from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan_files import read_plans
 from sagesplat.core.config import PlanConfig, RunConfig
-from sagesplat.core.errors import DataError, RunError
-from sagesplat.core.events import Event, RunDone, StageDone, StageSkipped, Training
-from sagesplat.formats.levels import read_level
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Event, RunDone, StageDone, StageSkipped
 from sagesplat.formats.ply import read_ply
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -108,30 +107,6 @@ def test_other_settings_need_force_and_redo_only_what_depends_on_them(
     assert named(work(run, capture, other, force=True), StageDone) == PLANNED
 
 
-def test_a_killed_run_goes_on_and_ends_with_the_same_levels(
-    finished: Path, capture: Path, config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Killed(Exception):
-        pass
-
-    def emit(event: Event) -> None:
-        if isinstance(event, Training) and event.step == 71:
-            raise Killed
-
-    with pytest.raises(Killed):
-        run_all(Job(RunDir(tmp_path / "run", "snapshots"), emit), capture, config)
-    monkeypatch.setattr(
-        "sagesplat.stages.pipeline.measure_and_plan", lambda job, config: None
-    )  # only levels are compared
-    events = work(tmp_path / "run", capture, config)
-    assert named(events, StageSkipped) == STAGES[:-1]
-    assert min(e.step for e in events if isinstance(e, Training)) == 61
-    for level in (30, 60, 90):
-        a, b = (read_level(folder / "levels" / f"{level:06d}.npz") for folder in (finished, tmp_path / "run"))
-        for name, value in a.parameters().items():
-            np.testing.assert_array_equal(value, b.parameters()[name], err_msg=name)
-
-
 def test_a_run_folder_of_another_scene_is_refused(
     finished: Path, capture: Path, config: RunConfig, tmp_path: Path
 ) -> None:
@@ -161,13 +136,3 @@ def test_export_takes_levels_and_categories(finished: Path, tmp_path: Path) -> N
         export_scene(job, tmp_path / "b.ply", level=None, labels=["cat"], target=None)
     with pytest.raises(RunError, match=r"no plan for SSIM 0\.77"):
         export_scene(job, tmp_path / "b.ply", level=None, labels=[], target=("ssim", 0.77))
-
-
-def test_a_broken_level_is_one_clear_error(
-    finished: Path, capture: Path, config: RunConfig, tmp_path: Path
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
-    (run / "levels" / "000060.npz").write_bytes(b"PK\x03\x04 broken")
-    with pytest.raises(DataError, match=r"levels/000060\.npz: not a readable level"):
-        work(run, capture, config)

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,7 @@ from PIL import Image
 from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped
-from sagesplat.io.files import read_json, write_json
 from sagesplat.run import capture as run_capture
-from sagesplat.run.capture import Hashes, read_capture
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 from sagesplat.run.run_dir import RunDir
@@ -53,9 +50,17 @@ def replace_photo(path: Path) -> None:
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
+def await_later_time(path: Path) -> None:
+    """Return when the clock of the file system, which is coarse, gives later times than that of `path`."""
+    probe = path.with_name("probe")
+    while not probe.exists() or probe.stat().st_ctime_ns <= path.stat().st_ctime_ns:
+        probe.touch()
+    probe.unlink()
+
+
 def test_a_photo_of_the_same_size_and_time_is_noticed(tmp_path: Path, capture: Path) -> None:
     begin(tmp_path / "run", capture)
-    time.sleep(0.02)  # clocks of file systems are no finer
+    await_later_time(capture / "images" / "01.png")
     replace_photo(capture / "images" / "01.png")
     for act in (
         lambda: begin(tmp_path / "run", capture),
@@ -102,22 +107,7 @@ def test_photos_are_read_once_unless_they_changed(tmp_path: Path, capture: Path,
     assert read[4:] == ["02.png"]
 
 
-def test_a_run_folder_from_before_hashes_works(tmp_path: Path, capture: Path) -> None:
-    run = RunDir(tmp_path / "run")
-    begin(run.path, capture)
-    scene = read_json(run.scene)
-    del scene["photos"]
-    write_json(run.scene, scene)
-    record = read_json(run.provenance("scene"))
-    del record["settings"]["photos"]
-    write_json(run.provenance("scene"), record)
-    run.photo_hashes.unlink()
-    assert isinstance(begin(run.path, capture)[-1], StageSkipped)
-    assert read_capture(run.scene).photos is None
-    assert Job(run, lambda event: None).scene.views
-
-
-@pytest.mark.parametrize("content", ["[]", '{"00.png": 7}', '{"00.png": [1, 2, 3, "x"]}', "\0", "{"])
+@pytest.mark.parametrize("content", ["{", '{"00.png": [1, 2, 3, "x"]}'])
 def test_a_damaged_list_of_hashes_is_made_anew(tmp_path: Path, capture: Path, content: str) -> None:
     begin(tmp_path / "run", capture)
     RunDir(tmp_path / "run").photo_hashes.write_text(content)
@@ -134,9 +124,3 @@ def test_photos_without_poses_are_known_by_their_content(tmp_path: Path) -> None
     assert scene_stage._hashes(job, photos).sha256 == hashes.sha256
     (photos / "a.jpg").write_bytes(b"two")
     assert scene_stage._hashes(job, photos).sha256 != hashes.sha256
-
-
-def test_hashes_of_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(b"a")
-    (tmp_path / "file").touch()
-    Hashes(tmp_path / "file" / "kept.json", {"a": tmp_path / "a"}).keep()

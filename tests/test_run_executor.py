@@ -23,7 +23,7 @@ from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import Event, Progress, StageDone, StageStarted, Training, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import write_text
-from sagesplat.run.executor import LOCAL, EventBuffer, ProgressAggregator, Task, results, split
+from sagesplat.run.executor import LOCAL, ProgressAggregator, Task, results, split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
@@ -155,13 +155,6 @@ def test_a_warning_of_several_tasks_is_said_once() -> None:
     assert heard == [Warned("same")] * 3 + [StageDone("a", 1.0, ())]
 
 
-def test_the_post_gives_each_event_once() -> None:
-    post = EventBuffer()
-    post.tell("run", 3, Warned("text"))
-    assert post.take() == [("run", 3, Warned("text"))]
-    assert post.take() == []
-
-
 def again(finished: Path, to: Path, executor, *gone: str) -> tuple[Job, list[Event]]:
     """A copy of a finished run, some of its stages to be done again."""
     shutil.copytree(finished, to)
@@ -213,14 +206,6 @@ def test_tasks_of_one_process_share_the_scene_and_the_photos(finished: Path) -> 
     assert opened.scene is job.scene
     assert opened.photos is job.photos
     assert replace(opened, run=RunDir(finished, "snapshots")).photos is job.photos
-
-
-def test_what_an_executor_has_decides_what_tasks_compute_with(tmp_path: Path) -> None:
-    executor = Shuffled()
-    executor.backend, executor.memory = "cuda", 5 * 10**9
-    job = Job(RunDir(tmp_path), lambda event: None, "cpu", executor=executor)
-    assert (job.spec.backend, job.spec.memory_limit, job.gpus) == ("cuda", 5 * 10**9, 1)
-    assert replace(job, memory_limit=10**9).spec.memory_limit == 10**9
 
 
 def test_a_capture_that_a_node_does_not_see_is_one_line(finished: Path, tmp_path: Path) -> None:
@@ -287,6 +272,7 @@ variants.c.train.sh_degree = 0
 """
 
 
+@pytest.mark.slow
 def test_a_sweep_in_any_order_writes_the_same_tables(capture: Path, tmp_path: Path) -> None:
     (tmp_path / "capture").symlink_to(capture)
     (tmp_path / "sweep.toml").write_text(SWEEP)
@@ -306,6 +292,7 @@ def test_a_sweep_in_any_order_writes_the_same_tables(capture: Path, tmp_path: Pa
     assert shared[0].samefile(shared[1])
 
 
+@pytest.mark.slow
 def test_baselines_are_trained_side_by_side(finished: Path, tmp_path: Path) -> None:
     files = {}
     for name, executor in (("local", LOCAL), ("shuffled", Shuffled())):

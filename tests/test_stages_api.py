@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -10,10 +9,8 @@ from conftest import DemoRun
 
 from sagesplat import (
     FinishedRun,
-    SageError,
     open_run,
     read_ply,
-    run_scene,
 )
 from sagesplat.adapt.plan_files import read_plans
 from sagesplat.core.errors import RunError
@@ -94,11 +91,8 @@ def test_a_phone_knows_the_distances_of_the_photos(runs):
 
 def test_impossible_targets_of_a_camera_are_one_line(runs):
     camera = runs["nested"].scene.views[0].camera
-    for target in (0.0, 1.5, math.nan):
-        with pytest.raises(RunError, match=r"target fidelity .* is impossible; choose"):
-            runs["nested"].plan_camera(camera, target_fidelity=target)
-        with pytest.raises(RunError, match=r"target SSIM .* is impossible; choose"):
-            runs["nested"].plan_camera(camera, target_ssim=target)
+    with pytest.raises(RunError, match=r"--target-fidelity 1\.5 is impossible; choose"):
+        runs["nested"].plan_camera(camera, target_fidelity=1.5)
     with pytest.raises(RunError, match="one target; give"):
         runs["nested"].plan_camera(camera, target_fidelity=0.9, target_ssim=0.5)
     with pytest.raises(RunError, match="needs the nested ladder; give --target-ssim"):
@@ -115,13 +109,3 @@ def test_a_composition_is_what_the_run_wrote(runs, ladder):
     assert torch.equal(run.compose(plan.levels).label_ids, written.label_ids)
     assert set(run.names) >= set(plan.levels)
     assert [plan.target for plan in run.plans] == [0.3, 0.4, 0.5]
-
-
-def test_what_is_no_run_folder_is_said(tmp_path: Path):
-    with pytest.raises(RunError, match="not a run folder"):
-        open_run(tmp_path)
-
-
-def test_an_impossible_backend_is_said(tmp_path: Path):
-    with pytest.raises(SageError, match="backend cuda does not run on cpu"):
-        run_scene(tmp_path, tmp_path / "run", device="cpu", backend="cuda")

@@ -13,12 +13,11 @@ from sagesplat.core.config import BlocksConfig, CleanConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped
 from sagesplat.formats.levels import read_header, read_level, select_level, write_level
-from sagesplat.io.files import write_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.blocks import train_scene
-from sagesplat.stages.clean import CleanFigures, clean_levels, clean_lines, read_clean_figures
+from sagesplat.stages.clean import clean_levels, clean_lines, read_clean_figures
 
 
 @pytest.fixture
@@ -100,15 +99,6 @@ def test_another_training_is_cleaned_anew(run: RunDir) -> None:
     assert not any(path.exists() for path in made)
 
 
-def test_a_scene_in_blocks_and_an_adopted_splat_are_refused(run: RunDir) -> None:
-    write_json(run.division, {})
-    with pytest.raises(RunError, match=r"blocks: floaters are not removed from a scene in blocks"):
-        clean_levels(job_of(run), CleanConfig())
-    run.adopted.write_bytes(b"")
-    with pytest.raises(RunError, match=r"a splat that was trained elsewhere"):
-        clean_levels(job_of(run), CleanConfig())
-
-
 def test_a_level_is_selected_as_it_is_stored(run: RunDir, tmp_path: Path) -> None:
     source = last_level(run)
     g = read_level(source)
@@ -121,40 +111,3 @@ def test_a_level_is_selected_as_it_is_stored(run: RunDir, tmp_path: Path) -> Non
     assert read_header(tmp_path / "some.npz").step == read_header(source).step
     with pytest.raises(ValueError, match="3 rows for"):
         select_level(source, tmp_path / "none.npz", np.ones(3, bool))
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        "[]",
-        "{}",
-        '{"gaussians": 3, "found": {"in front": 1}, "removed": {"in front": 2}, "before": {}, "after": {}}',
-    ],
-)
-def test_figures_that_are_none_are_refused(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "floaters.json"
-    path.write_text(content)
-    with pytest.raises(RunError, match=r"floaters\.json: not what was cleaned .*sagesplat clean RUN"):
-        read_clean_figures(path)
-
-
-def test_damaged_figures_are_made_again_as_their_error_says(run: RunDir) -> None:
-    spoil(run)
-    run.floaters.write_text("[]")
-    with pytest.raises(RunError, match=r"delete it and run `sagesplat clean RUN`"):
-        clean_levels(job_of(run), CleanConfig())
-    run.floaters.unlink()
-    clean_levels(job_of(run), CleanConfig())
-    assert read_clean_figures(run.floaters) is not None
-
-
-def test_figures_in_words() -> None:
-    figures = CleanFigures(
-        1000,
-        {"hardly shown": 5, "in front": 4, "category": 0}, {"hardly shown": 5, "in front": 1, "category": 0},
-        {"train": 20.0}, {"train": 19.99},
-    )  # fmt: skip
-    assert clean_lines(figures) == [
-        "6 of 1,000 Gaussians removed: 5 hardly shown, 1 in front (of 4)",
-        "train views -0.010 dB",
-    ]

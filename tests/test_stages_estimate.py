@@ -14,7 +14,7 @@ from sagesplat.demo.capture import make_capture
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import estimate
-from sagesplat.stages.estimate import grown, step_seconds, tell_duration
+from sagesplat.stages.estimate import grown, tell_duration
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
 
@@ -50,12 +50,6 @@ def test_a_grown_model_covers_as_much_as_what_it_grew_from() -> None:
     assert len(grown(g, 120)) == 120
 
 
-def test_a_step_is_timed_on_this_machine(job: Job) -> None:
-    fixed, each = step_seconds(job, CONFIG.train, 200)
-    assert 0 <= fixed < 60
-    assert 0 <= each < 1
-
-
 def test_a_run_of_minutes_is_announced_by_its_parts(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimate, "step_seconds", lambda *_: (0.25, 0.0))
     (text,) = said(job)
@@ -79,19 +73,4 @@ def test_nothing_is_said_of_what_is_short_begun_or_not_done_here(
     assert said(job, replace(CONFIG, blocks=BlocksConfig(count=2))) == []
     assert np.isfinite(estimate.training_seconds(job, CONFIG.train, 100, 1.0, 0.0))
     job.run.checkpoint.touch()
-    assert said(job) == []
-
-
-def test_snapshots_are_not_measured_at_drawn_viewpoints(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate, "step_seconds", lambda *_: (1.0, 0.0))
-    events: list[Event] = []
-    tell_duration(Job(RunDir(job.run.path, "snapshots"), events.append, "cpu"), CONFIG)
-    (text,) = [event.text for event in events if isinstance(event, Noted)]
-    assert "levels" not in text
-    assert "measuring 40 s" in text  # 29 levels in 6 views, a quarter of a second each
-
-
-def test_nothing_is_timed_where_no_pixel_counts(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estimate, "step_seconds", lambda *_: (1.0, 0.0))
-    monkeypatch.setattr(type(job.valid), "rows", lambda *_: [])
     assert said(job) == []

@@ -108,16 +108,6 @@ def test_label_images_of_a_network_are_fused(
     assert all(0 <= share <= 1 for share in made["agreement"])
 
 
-def test_what_a_segmenter_needs_is_said(capture: Path, tmp_path: Path) -> None:
-    job, _ = begun(tmp_path / "run", capture)
-    with pytest.raises(RunError, match=r"--segmenter onnx needs --model NETWORK\.onnx and --classes"):
-        make_masks(job, MasksConfig(segmenter="onnx"))
-    with pytest.raises(RunError, match=r"a\.pth: no such file; --segmenter deeplabv2 needs"):
-        make_masks(job, MasksConfig(model="a.pth"))
-    with pytest.raises(RunError, match=r"a\.onnx: no such file"):
-        make_masks(job, MasksConfig(model="a.onnx"))
-
-
 def test_photos_without_poses_become_a_capture(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,12 +134,6 @@ def test_photos_without_poses_become_a_capture(
     assert "--poses.camera per-image" in warned[1]
     assert job.scene.path == (tmp_path / "run" / "capture" / "images").resolve()
     assert len(job.scene.views) == 8
-
-
-def test_a_run_among_the_photos_is_refused(capture: Path) -> None:
-    job = Job(RunDir(capture / "images" / "run"), lambda event: None)
-    with pytest.raises(RunError, match="lies among the photos"):
-        open_scene(job, capture / "images", SceneConfig())
 
 
 def valid_in(job: Job) -> list[np.ndarray | None]:

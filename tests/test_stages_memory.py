@@ -11,8 +11,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, Warned
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
-from sagesplat.segment.hf import DEFAULT_MODEL
-from sagesplat.stages.memory import check_nest, check_network, network_memory, weights
+from sagesplat.stages.memory import check_nest, check_network, network_memory
 from sagesplat.stages.scene import open_scene
 from sagesplat.train.memory import GIB
 
@@ -82,12 +81,3 @@ def test_a_network_that_cannot_fit_is_one_line(job: Job, tmp_path: Path) -> None
     assert "\n" not in line
     check_network(replace(job, memory_limit=GIB), "onnx", {"model": model})
     check_network(replace(small, backend="cuda"), "onnx", {"model": model})
-
-
-def test_the_size_of_weights(tmp_path: Path) -> None:
-    for name in ("model-1.safetensors", "model-2.safetensors", "other.bin"):
-        (tmp_path / name).write_bytes(bytes(100))
-    assert weights(tmp_path) == 200
-    assert weights(tmp_path / "other.bin") == 100
-    assert weights(DEFAULT_MODEL) > 90e6
-    assert weights("owner/name") == 0

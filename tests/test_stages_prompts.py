@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sagesplat.core.config import MasksConfig, SceneConfig
-from sagesplat.core.errors import LabelError, RunError
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, Noted, StageDone, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.run.job import Job
@@ -17,10 +17,8 @@ from sagesplat.segment import text
 from sagesplat.segment.detections import Found
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.segmenters import Segmented
-from sagesplat.stages import prompts
 from sagesplat.stages.label import make_masks, segmenter_kind
-from sagesplat.stages.memory import check_network
-from sagesplat.stages.prompts import Timed, read_scores
+from sagesplat.stages.prompts import read_scores
 from sagesplat.stages.scene import open_scene
 
 CONFIG = MasksConfig(segmenter="text", prompts="stone fountain; ivy; tree")
@@ -105,18 +103,6 @@ def test_words_become_categories_and_what_is_found_nowhere_is_said(capture: Path
         make_masks(job, MasksConfig(segmenter="text", prompts="stone fountain"))
 
 
-@pytest.mark.parametrize(
-    ("score", "line"),
-    [
-        (0.12, "its best score is 0.12 and 0.3 is needed"),
-        (0.2996, "its best score is 0.2996 and 0.3 is needed"),  # not 0.30, which would do
-        (0.65, "found with a score of up to 0.65, but other prompts have a larger probability"),
-    ],
-)
-def test_why_a_prompt_has_no_pixels(score: float, line: str) -> None:
-    assert line in prompts._missing("ivy", score, 0.3)
-
-
 def test_a_killed_segmentation_goes_on(capture: Path, tmp_path: Path) -> None:
     Left.killed_after = 4
     job, _ = begun(tmp_path / "run", capture)
@@ -135,16 +121,6 @@ def test_a_killed_segmentation_goes_on(capture: Path, tmp_path: Path) -> None:
     make_masks(job, other)
     assert Left.calls == 12
     assert job.taxonomy.names == {201: "wooden bench"}
-
-
-def test_nothing_found_at_all_is_one_line(capture: Path, tmp_path: Path) -> None:
-    job, _ = begun(tmp_path / "run", capture)
-    with pytest.raises(
-        LabelError, match=r"prompt 'nothing': found in no photo; its best score is 0\.16"
-    ) as e:
-        make_masks(job, MasksConfig(segmenter="text", prompts="nothing; ivy"))
-    assert "prompt 'ivy'" in str(e.value)
-    assert "\n" not in str(e.value)
 
 
 class Grass:
@@ -222,22 +198,3 @@ def test_two_words_for_the_same_masks_are_said(capture: Path, tmp_path: Path) ->
         "prompts 'stone fountain' and 'basin': the network finds the same for both (their masks overlap by "
         '97%); leave one of them, or add --labels.merge "basin=stone fountain"'
     ]
-
-
-def test_times_are_told_as_people_tell_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter([0.0, 5.0])
-    monkeypatch.setattr(prompts.time, "perf_counter", lambda: next(clock))
-    said: list[str] = []
-    timed = Timed(Grass(), lambda: 185, said.append)
-    for _ in range(2):
-        if not said:
-            timed([np.zeros((2, 2, 3), np.uint8)])
-    assert said == ["segmentation takes about 15 min for 185 photos on this machine"]
-
-
-def test_networks_that_do_not_fit_are_refused_before_they_are_loaded(capture: Path, tmp_path: Path) -> None:
-    job, _ = begun(tmp_path / "run", capture, memory_limit=2**30)
-    with pytest.raises(RunError, match=r"needs at least about 1\.7 GiB"):
-        check_network(job, "text", text.settings(CONFIG))
-    light = MasksConfig(segmenter="text", prompts="ivy", model="CIDAS/clipseg-rd64-refined")
-    check_network(job, "text", text.settings(light))

@@ -10,7 +10,6 @@ from conftest import SMALL_RUN
 from sagesplat.core.config import BlocksConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone
-from sagesplat.io.files import write_json
 from sagesplat.run.job import Job
 from sagesplat.run.records import uses
 from sagesplat.run.run_dir import RunDir
@@ -19,10 +18,9 @@ from sagesplat.stages import blocks
 from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.observe import observe_levels
-from sagesplat.stages.refine import PoseFigures, pose_lines, read_refined_figures
+from sagesplat.stages.refine import read_refined_figures
 
 POSES = replace(SMALL_RUN.train, max_steps=40, level_every=20, poses=True)
-FIGURES = PoseFigures(0.3, 0.02, 0.001, 1, 2, 3, (20.0, 24.5), (0.7, 0.8))
 
 
 @pytest.fixture(scope="module")
@@ -84,18 +82,3 @@ def test_poses_and_blocks_are_refused():
     with pytest.raises(RunError, match=r"--train\.poses does not go with --blocks\.count; leave out one"):
         blocks.check(BlocksConfig(count=2), POSES)
     blocks.check(BlocksConfig(), POSES)
-
-
-def test_lines_say_what_diverged():
-    assert "1 poses diverged and were put back as given" in pose_lines(FIGURES)
-    assert "1 of 3 held-out poses could not be fitted, and stay as given" in pose_lines(FIGURES)
-    assert len(pose_lines(replace(FIGURES, diverged=0, fitted=3, psnr=None, ssim=None))) == 1
-
-
-@pytest.mark.parametrize("content", [[], {"poses": []}, *({"poses": {"pixels": x}} for x in ("far", 1.0))])
-def test_other_figures_are_refused(tmp_path, content):
-    path = tmp_path / "refined.json"
-    assert read_refined_figures(path).poses is None
-    write_json(path, content)
-    with pytest.raises(RunError, match=r"refined\.json: not what was refined .*--force"):
-        read_refined_figures(path)

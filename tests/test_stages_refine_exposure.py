@@ -20,13 +20,9 @@ from sagesplat.stages import blocks
 from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.refine import read_refined_figures
-from sagesplat.stages.refine_exposure import ExposureFigures, exposure_lines
 from sagesplat.stages.results import evaluation_of
 
 CONFIG = replace(SMALL_RUN, train=replace(SMALL_RUN.train, exposure="affine"))
-FIGURES = ExposureFigures(
-    1.4, {"plain": 20.0, "exposed": 24.0, "cc": 23.5}, {"plain": 0.7, "exposed": 0.75, "cc": 0.74}
-)
 
 
 @pytest.fixture(scope="module")
@@ -99,17 +95,3 @@ def test_blocks_refuse_it():
     with pytest.raises(RunError, match=r"--train\.exposure affine does not go with --blocks.count"):
         blocks.check(BlocksConfig(count=2), config)
     blocks.check(BlocksConfig(count=2), RunConfig().train)
-
-
-def test_lines_and_files_of_figures(tmp_path):
-    assert "cc_ssim 0.740 / cc_psnr 23.50 dB" in exposure_lines(FIGURES)[1]
-    assert len(exposure_lines(replace(FIGURES, psnr=None, ssim=None))) == 1
-    path = tmp_path / "refined.json"
-    for content in ([], {"exposure": 3}, {"exposure": {"range_ev": 1}}):
-        write_json(path, content)
-        with pytest.raises(RunError, match=r"refined\.json"):
-            read_refined_figures(path)
-    wrong = {"range_ev": 1.0, "psnr": {"plain": 1.0}, "ssim": None}
-    write_json(path, {"exposure": wrong})
-    with pytest.raises(RunError, match="other measurements"):
-        read_refined_figures(path)

@@ -13,7 +13,6 @@ from sagesplat.adapt.fidelity import measure_compositions, measure_levels
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.adapt.viewpoints import Rule, draw, read_viewpoints
 from sagesplat.core.config import FitConfig, SampleConfig
-from sagesplat.core.errors import RunError, SageError
 from sagesplat.core.events import StageDone, StageSkipped
 from sagesplat.metrics.image import ssim_map
 from sagesplat.raster import rasterize
@@ -80,7 +79,7 @@ def test_done_once_and_again_with_other_settings(job: Job):
     assert [e.name for e in first if isinstance(e, StageDone)] == ["sample"]
     drawn = job.run.viewpoints.read_bytes()
     assert [e.name for e in again(job) if isinstance(e, StageSkipped)] == ["sample"]
-    again(job, replace(FEW, seed=1))
+    again(job, replace(FEW, shift=0.2))
     assert job.run.viewpoints.read_bytes() != drawn
     again(job, FEW)
     assert job.run.viewpoints.read_bytes() == drawn
@@ -107,33 +106,6 @@ def test_own_viewpoints(job: Job, tmp_path: Path):
     drawn = read_viewpoints(job.run.viewpoints)
     assert drawn.source == "path.json"
     assert all(np.abs(c.w2c - camera.w2c).max() < 1e-6 for c in drawn.cameras)
-
-
-def test_viewpoints_that_see_nothing_are_one_line(job: Job, tmp_path: Path):
-    away = np.eye(4)
-    away[:3, 3] = [0, 0, 1000]
-    path = tmp_path / "path.json"
-    path.write_text(json.dumps({"frames": [{"transform_matrix": (away * [1, -1, -1, 1]).tolist()}]}))
-    before = job.run.sampled.read_bytes()
-    with pytest.raises(RunError, match=r"none of 6 viewpoints shows anything of the scene.*--sample\.shift"):
-        again(job, replace(FEW, viewpoints=path))
-    assert job.run.sampled.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("config", "said"),
-    [
-        (SampleConfig(views=-1), "--sample.views -1 is impossible"),
-        (SampleConfig(shift=2.0), "--sample.shift 2.0 is impossible"),
-        (SampleConfig(viewpoints=Path("nothing.json")), "nothing.json"),
-    ],
-)
-def test_impossible_settings_are_one_line(job: Job, config: SampleConfig, said: str):
-    with pytest.raises(SageError) as caught:
-        again(job, config)
-    assert said in str(caught.value)
-    assert job.run.provenance("sample").exists()  # the earlier result still counts
-    assert "\n" not in str(caught.value)
 
 
 def test_numbers_follow_the_length_of_the_training(job: Job, monkeypatch: pytest.MonkeyPatch):

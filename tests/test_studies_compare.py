@@ -3,14 +3,12 @@
 import json
 import math
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sagesplat import cli
 from sagesplat.core.config import (
     CompareConfig,
     FitConfig,
@@ -159,10 +157,9 @@ def test_a_comparison_reads_back_and_damage_is_one_line(tmp_path):
     again, same = read_comparison(tmp_path / "c.json")
     assert repr(again) == repr(points)
     assert same == walks
-    for broken in ({"points": 3}, {"points": [{}], "walks": []}, {"points": [], "walks": [{"x": 1}]}, []):
-        write_json(tmp_path / "c.json", broken)
-        with pytest.raises(DataError, match=r"c.json: not a comparison .* compare again"):
-            read_comparison(tmp_path / "c.json")
+    write_json(tmp_path / "c.json", {"points": [{}], "walks": []})
+    with pytest.raises(DataError, match=r"c.json: not a comparison .* compare again"):
+        read_comparison(tmp_path / "c.json")
 
 
 @pytest.fixture(scope="module")
@@ -239,19 +236,6 @@ def test_mcmc_keeps_its_cap_even_below_the_number_of_points(compared):
         assert 0.8 * share * full < len(g) <= round(share * full)
 
 
-def test_a_random_subset_of_the_points_keeps_labels_and_tracks(finished):
-    scene, labels = finished.scene, finished.point_labels
-    few, mine = with_at_most(scene, labels, 100, 3)
-    assert len(few.points.xyz) == len(few.points.rgb) == len(mine) == 100
-    rows = [int(np.flatnonzero((scene.points.xyz == xyz).all(1))[0]) for xyz in few.points.xyz]
-    np.testing.assert_array_equal(mine, labels[rows])
-    kept = np.isin(scene.points.track_points, rows)
-    np.testing.assert_array_equal(np.array(rows)[few.points.track_points], scene.points.track_points[kept])
-    np.testing.assert_array_equal(few.points.track_uv, scene.points.track_uv[kept])
-    np.testing.assert_array_equal(with_at_most(scene, labels, 100, 3)[1], mine)
-    assert with_at_most(scene, labels, 10**6, 3)[0] is scene
-
-
 def test_a_second_comparison_trains_nothing_and_a_killed_one_goes_on(compared):
     job, _, _ = compared
     events: list[Event] = []
@@ -272,42 +256,6 @@ def test_a_second_comparison_trains_nothing_and_a_killed_one_goes_on(compared):
     assert not list(folder.glob("pruned-0.2*"))  # it was refused before anything was trained
 
 
-def test_the_command(compared, monkeypatch, capsys, tmp_path):
-    job, _, _ = compared
-    words = ["--targets", "0.3", "0.5", "--snapshots", "3", "--shares", "0.3", "--tune-steps", "5"]
-    words += [
-        "--caps",
-        "0.2",
-        "1",
-        "--budgets",
-        "4",
-        "--lpips",
-        "nowhere",
-        "--json",
-        str(tmp_path / "c.json"),
-    ]
-    monkeypatch.setattr(sys, "argv", ["sagesplat", "compare", str(job.run.path), *words, "--threads", "1"])
-    cli.main()
-    assert "Worst" not in capsys.readouterr().err
-    assert len(read_comparison(tmp_path / "c.json")[0]) > 10
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"shares": (0.1, 1.2)}, "--shares 0.1 1.2 is impossible"),
-        ({"caps": (0.0,)}, "--caps 0.0 is impossible"),
-        ({"caps": (1e-6,)}, "--caps 1e-06 leaves too few"),
-        ({"tune_steps": -2}, "--tune-steps -2 is impossible"),
-        ({"budgets": 1}, "--budgets 1 is impossible"),
-        ({"targets": (1.5,)}, "--targets 1.5 is impossible"),
-    ],
-)
-def test_impossible_settings_are_refused(finished, change, says):
-    with pytest.raises(RunError, match=says):
-        compare(finished, replace(CONFIG, **change))
-
-
 def test_runs_that_cannot_be_compared_are_refused(finished, tmp_path):
     with pytest.raises(RunError, match="not a run folder"):
         compare(Job(RunDir(tmp_path / "nothing"), lambda event: None), CONFIG)
@@ -318,10 +266,16 @@ def test_runs_that_cannot_be_compared_are_refused(finished, tmp_path):
     (folder / "nested" / "promises.json").unlink()
     with pytest.raises(RunError, match=r"promises.json: missing.* finish `sagesplat run`"):
         compare(Job(RunDir(folder), lambda event: None), CONFIG)
-    shutil.rmtree(folder / "nested")
-    with pytest.raises(RunError, match=r"ladder.npz: missing"):
-        compare(Job(RunDir(folder), lambda event: None), CONFIG)
-    made = read_json(folder / "scene.json")
-    write_json(folder / "scene.json", {**made, "settings": {**made["settings"], "test_every": 0}})
-    with pytest.raises(RunError, match=r"no test views to compare on"):
-        compare(Job(RunDir(folder), lambda event: None), CONFIG)
+
+
+def test_a_random_subset_of_the_points_keeps_labels_and_tracks(finished):
+    scene, labels = finished.scene, finished.point_labels
+    few, mine = with_at_most(scene, labels, 100, 3)
+    assert len(few.points.xyz) == len(few.points.rgb) == len(mine) == 100
+    rows = [int(np.flatnonzero((scene.points.xyz == xyz).all(1))[0]) for xyz in few.points.xyz]
+    np.testing.assert_array_equal(mine, labels[rows])
+    kept = np.isin(scene.points.track_points, rows)
+    np.testing.assert_array_equal(np.array(rows)[few.points.track_points], scene.points.track_points[kept])
+    np.testing.assert_array_equal(few.points.track_uv, scene.points.track_uv[kept])
+    np.testing.assert_array_equal(with_at_most(scene, labels, 100, 3)[1], mine)
+    assert with_at_most(scene, labels, 10**6, 3)[0] is scene

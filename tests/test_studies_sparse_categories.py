@@ -15,7 +15,6 @@ from sagesplat.adapt.plan_files import read_plans
 from sagesplat.adapt.viewpoint import read_promises
 from sagesplat.core.config import (
     CompareConfig,
-    LadderKind,
     NestConfig,
     PaperConfig,
     PlanConfig,
@@ -81,6 +80,7 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ladder", ["nested", pytest.param("snapshots", marks=pytest.mark.slow)])
 def test_every_stage_and_study_takes_them(ladder, capture, trained, tmp_path):
     run = Path(shutil.copytree(trained, tmp_path / "run"))

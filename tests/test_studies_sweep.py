@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from test_stages_label import Halves
 
@@ -16,16 +16,15 @@ from sagesplat.core.config import MasksConfig, PlanConfig, RunConfig, SceneConfi
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, TableMade, Training, Warned
 from sagesplat.demo.capture import make_capture
-from sagesplat.io.files import link, write_text
+from sagesplat.io.files import link
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment import hf
 from sagesplat.studies.sweep import run
 from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.studies.sweep.report import MEASURES, Row, readable, summarise
-from sagesplat.studies.sweep.run import _share_training, _trained_alike, run_sweep
+from sagesplat.studies.sweep.run import _share_training, run_sweep
 
-ROOT = Path(__file__).parents[1]
 TEXT = """
 targets = [0.4, 0.3]
 seeds = [0, 5]
@@ -181,20 +180,6 @@ def test_a_shared_training_is_there_as_a_whole_or_not_at_all(copy: Path, monkeyp
     assert RunDir(runs / new.name).cameras.read_bytes() == b"refined"
 
 
-def test_blocks_are_trained_by_each_cell(tmp_path: Path) -> None:
-    text = "targets = [0.4]\nseeds = [0]\nscenes.plot = 'demo'\nvariants.whole = {}\n"
-    text += "variants.two.blocks.count = 2\n"
-    text += "variants.near.blocks.count = 2\nvariants.near.fit.distance = 'minimum'\n"
-    whole, two, near = read_sweep(write(tmp_path, text))
-    assert _trained_alike([whole], two) is None
-    assert _trained_alike([whole, two], near) == two
-    made = RunDir(tmp_path / two.name)
-    made.blocks.mkdir(parents=True)
-    write_text(made.provenance("train"), "{}")
-    _share_training(tmp_path, two, near)  # what is in a block's folder names that folder
-    assert not (tmp_path / near.name).exists()
-
-
 def test_a_cell_that_fails_is_recorded_and_the_others_go_on(copy: Path) -> None:
     (copy / "empty").mkdir()
     sweep = read_sweep(write(copy, TEXT.replace("scenes", 'scenes.bad = "empty"\nscenes')))
@@ -230,16 +215,6 @@ def test_changed_settings_fail_unless_forced(copy: Path) -> None:
     assert row["SSIM"]
 
 
-def test_without_test_views_quality_is_unknown(copy: Path) -> None:
-    text = TEXT.replace("60", "10").replace("settings", "settings.scene.test_every = 0\nsettings", 1)
-    sweep = read_sweep(write(copy, text))[:1]
-    (row,) = run_sweep(sweep, copy / "new", lambda _: None).rows[:1]
-    assert row[-2:] == ("–", "–")
-    (row, _) = rows_of(copy / "new" / "cells.csv")
-    assert int(row["Gaussians"]) > 0
-    assert (row["SSIM"], row["full PSNR"], row["promised"], row["share kept"]) == ("", "", "0", "")
-
-
 def test_an_interrupted_sweep_keeps_what_is_done(copy: Path) -> None:
     def interrupt(event: Event) -> None:
         if isinstance(event, Training):
@@ -249,13 +224,6 @@ def test_an_interrupted_sweep_keeps_what_is_done(copy: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run_sweep(sweep, copy / "out", interrupt)
     assert {row["seed"] for row in rows_of(copy / "out" / "cells.csv")} == {"0"}
-
-
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
-    sweep = read_sweep(write(tmp_path, TEXT))
-    with pytest.raises(RunError, match="not empty and not the folder of a sweep"):
-        run_sweep(sweep, tmp_path, print)
-    assert {path.name for path in tmp_path.iterdir()} == {"capture", "sweep.toml"}
 
 
 def test_settings_and_variants_become_the_configuration_of_each_cell(tmp_path: Path) -> None:
@@ -291,20 +259,6 @@ def test_settings_and_variants_become_the_configuration_of_each_cell(tmp_path: P
     assert plot.config.plan.targets == [0.5, 0.9, 1.0]
 
 
-def test_without_variants_a_cell_is_a_scene_and_a_seed(tmp_path: Path) -> None:
-    text = 'targets = [0.8]\nseeds = [0, 1]\nscenes.plot = "capture"'
-    sweep = read_sweep(write(tmp_path, text))
-    assert [cell.name for cell in sweep] == ["plot-seed0", "plot-seed1"]
-    assert [cell.config for cell in sweep] == [
-        RunConfig(plan=PlanConfig(target_ssim=0.8, other_targets=()), seed=seed) for seed in (0, 1)
-    ]
-
-
-def test_the_example_is_a_sweep() -> None:
-    sweep = read_sweep(ROOT / "examples" / "sweep.toml")
-    assert {cell.capture for cell in sweep} == {None}
-
-
 HEAD = 'targets = [0.8]\nseeds = [0]\nscenes.plot = "capture"\n'
 
 
@@ -312,46 +266,19 @@ HEAD = 'targets = [0.8]\nseeds = [0]\nscenes.plot = "capture"\n'
     ("text", "message"),
     [
         ("targets = [", "not readable as TOML"),
-        (HEAD + "x = 1", "'x': no such key; there are targets, seeds"),
+        (HEAD + '"a\\nb" = 1', r"'a\\nb': no such key; there are targets, seeds"),
         (HEAD + "settings.train.steps = 1", r"settings\.train\.'steps': no such key; there are max_steps"),
-        (HEAD + '"a\\nb" = 1', r"'a\\nb': no such key"),
-        (HEAD + "settings.train.max_steps = 0.5", r"train\.max_steps: expected int, got float"),
         (HEAD + "settings.train.max_steps = -5", r"train\.max_steps: expected int >= 1"),
-        (HEAD + "settings.train.antialiased = 1", "expected bool, got int"),
-        (HEAD + "settings.train.grow_grad = nan", r"grow_grad: expected float >= 0"),
-        (HEAD + "settings.train.grow_grad = -inf", r"grow_grad: expected float >= 0"),
-        (HEAD + f"settings.train.grow_grad = 1{'0' * 400}", "out of range"),
-        (HEAD + "settings.train = 3", r"train: expected object, got int"),
-        (HEAD + "settings = 3", "settings: expected object, got int"),
         (HEAD + "settings.masks.masks = 3", r"masks\.masks: 3 is no path"),
-        (HEAD + "settings.train.strategy = 'all'", r"strategy: invalid enum value 'all'"),
         (HEAD + "settings.seed = 1", r"settings\.seed: set by the list seeds"),
-        (HEAD + "settings.plan.target_ssim = 1", r"settings\.plan\.target_ssim: set by the list targets"),
         (HEAD + "variants.a.plan.other_targets = [1]", r"variants\.a\.plan\.other_targets: set by the list"),
-        (HEAD + "variants.a.train.step = 1", r"variants\.a\.train\.'step': no such key; there are"),
-        (HEAD + "variants.a = 1", r"expected object, got int"),
         (HEAD + "variants.'a/b' = {}", "variants: expected str matching"),
-        (HEAD + "variants.'' = {}", "variants: expected str matching"),
-        (HEAD + "scenes.'..' = 'capture'", "scenes: expected str matching"),
-        (HEAD + "scenes.plöt = 'capture'", "not readable as TOML|expected str matching"),
         (HEAD + "scenes.Plot = 'capture'", "two runs would be called plot-seed0"),
-        (
-            HEAD + "scenes.plot-a = 'capture'\nvariants = {b = {}, a-b = {}}",
-            "two runs .* called plot-a-b-seed0",
-        ),
         (HEAD + "scenes.other = 'nowhere'", r"scenes\.other: no folder .*nowhere"),
-        (HEAD + "scenes.other = 3", r"expected str, got int"),
         (HEAD.replace("scenes.plot", "#"), "missing required field scenes"),
-        (HEAD.replace("[0]", "[]"), "seeds: expected array of length >= 1"),
-        (HEAD.replace("targets", "#"), "missing required field targets"),
         (HEAD.replace("[0]", "[1, 2, 1]"), "seeds: two are equal"),
-        (HEAD.replace("[0]", "[-1]"), r"seeds\[0\]: expected int >= 0"),
-        (HEAD.replace("[0]", "[0, 1.0]"), r"seeds\[1\]: expected int, got float"),
-        (HEAD.replace("[0]", "3"), "seeds: expected array, got int"),
         (HEAD.replace("0.8", "0.8, 0.80000001"), "targets: two are equal"),
-        (HEAD.replace("0.8", "0.8, 0"), r"targets\[1\]: expected float > 0"),
         (HEAD.replace("0.8", "1.1"), r"targets\[0\]: expected float <= 1"),
-        (HEAD.replace("0.8", "nan"), r"targets\[0\]: expected float > 0"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
@@ -359,13 +286,6 @@ def test_what_is_wrong_with_a_file_is_one_line(tmp_path: Path, text: str, messag
     with pytest.raises(DataError, match=rf"sweep\.toml: .*({message})") as raised:
         read_sweep(path)
     assert "\n" not in str(raised.value)
-
-
-def test_a_missing_file_and_one_that_is_no_text_are_one_line(tmp_path: Path) -> None:
-    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
-    for name in ("none.toml", "bytes.toml"):
-        with pytest.raises(DataError, match=rf"{name}: not readable"):
-            read_sweep(tmp_path / name)
 
 
 def row(seed: int, ssim: float, *, scene: str = "a", status: str = "ok") -> Row:
@@ -393,7 +313,6 @@ def test_sums_by_hand() -> None:
 
 
 @given(st.lists(st.floats(0, 1) | st.just(math.nan), min_size=1, max_size=8))
-@settings(max_examples=60, deadline=None)
 def test_spread_is_that_of_the_known_values(values: list[float]) -> None:
     table = summarise([row(seed, value) for seed, value in enumerate(values)])
     (sums,) = (dict(zip(table.header, r, strict=True)) for r in table.rows)

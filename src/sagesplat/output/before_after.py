@@ -36,17 +36,7 @@ def before_after(
     antialiased: bool = False,
     backend: Backend = "cpu",
 ) -> None:
-    """Write a PNG of the cameras whose pictures change most: before, after, and only what goes.
-
-    Args:
-        path: The .png file; replaced if it is there.
-        g: N Gaussians.
-        keep: Which of them stay.
-        cameras: At least one; some of them are compared.
-        title: Put over it.
-        antialiased: As the Gaussians were trained.
-        backend: Of the renders.
-    """
+    """Write a PNG of the cameras whose pictures change most: before, after, and only what goes."""
     stays = torch.from_numpy(keep)
     parts, space = (g, g.select(stays), g.select(~stays)), Workspace()
 

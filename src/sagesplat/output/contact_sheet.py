@@ -45,15 +45,7 @@ def contact_sheet(
 ) -> None:
     """Write viewpoints as a PNG: maps from above and from the side, and small renders of the first ones.
 
-    Args:
-        path: The .png file; replaced if it is there.
-        g: N Gaussians.
-        cameras: At least one.
-        up: Unit vector, world.
-        lines: Put over it.
-        names: Of the cameras; None: their numbers.
-        antialiased: As the Gaussians were trained.
-        backend: Of the renders.
+    `up`: unit vector, world; `lines`: put over it; `names`: of the cameras; None: their numbers.
     """
     shown, workspace = cameras[:MOST], Workspace()
     pictures = [

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from matplotlib import colormaps, rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -125,6 +126,18 @@ def error_image(
     return error
 
 
+def panel_grid(
+    count: int, columns: int, cell: tuple[float, float], beside: float, **shared: Any
+) -> tuple[Figure, list[Axes]]:
+    """A figure with `count` panels, line by line; `cell`: inches of one, `beside`: height of all else."""
+    lines = max(1, math.ceil(count / columns))
+    figure = Figure(figsize=(cell[0] * columns, cell[1] * lines + beside), layout="constrained")
+    grid = figure.subplots(lines, columns, squeeze=False, **shared).ravel()
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return figure, list(grid[:count])
+
+
 @rc_context(STYLE)
 def ssim_over_levels(
     observations: Observations,
@@ -148,12 +161,10 @@ def ssim_over_levels(
     }
     shown = [TOTAL, *labels]
     columns = min(len(shown), _columns(4, 3, labels, names))
-    count = math.ceil(len(shown) / columns)
-    figure = Figure(figsize=(9.6 * columns / 4, 1.75 * count + 0.7), layout="constrained")
-    grid = figure.subplots(count, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    figure, grid = panel_grid(len(shown), columns, (2.4, 1.75), 0.7, sharex=True, sharey=True)
     half = np.min(np.diff(levels)) / 2 if len(levels) > 1 else 0.5
     reset = sorted(recovering & set(levels.tolist()))
-    for at, (axes, label_id) in enumerate(zip(grid, shown, strict=False)):
+    for at, (axes, label_id) in enumerate(zip(grid, shown, strict=True)):
         colour = INK if label_id == TOTAL else ink(label_id, colours)
         for level in reset:
             axes.axvspan(level - half, level + half, color=_RESET, lw=0, zorder=0)
@@ -164,8 +175,6 @@ def ssim_over_levels(
         axes.set_title(caption(label_id, names), color=colour, loc="left", fontweight="bold", fontsize=9)
         axes.tick_params(labelbottom=at + columns >= len(shown))
         axes.locator_params(axis="x", nbins=4)
-    for axes in grid[len(shown) :]:
-        axes.set_axis_off()
     figure.supxlabel("level", fontsize=9)
     figure.supylabel("SSIM", fontsize=9)
     handles: list[Line2D | Patch] = [
@@ -191,13 +200,10 @@ def ssim_over_distance(
 ) -> Figure:
     """Fig. 3: SSIM of the training views (dots) and Eq. 3 (lines) over distance, a panel per label."""
     shown = [i for i in labels if any((i, level) in models for level in levels)]
-    columns = max(1, min(3, len(shown)))
-    lines = max(1, math.ceil(len(shown) / columns))
-    figure = Figure(figsize=(3.3 * columns, 2.3 * lines + 0.5), layout="constrained")
-    grid = figure.subplots(lines, columns, squeeze=False).ravel()
+    figure, grid = panel_grid(len(shown), max(1, min(3, len(shown))), (3.3, 2.3), 0.5)
     shades = colormaps["viridis"](np.linspace(0.85, 0.05, len(levels)))
     seen = np.isin(observations.view, train_views) & np.isfinite(observations.distance)
-    for axes, label_id in zip(grid, shown, strict=False):
+    for axes, label_id in zip(grid, shown, strict=True):
         for level, shade in zip(levels, shades, strict=True):
             rows = observations.select(
                 seen & (observations.label_id == label_id) & (observations.level == level)
@@ -207,8 +213,6 @@ def ssim_over_distance(
                 distance = np.linspace(*model.d_range, 200)
                 axes.plot(distance, model(distance), color=shade, lw=1.6)
         axes.set_title(caption(label_id, names), color=ink(label_id, colours), loc="left", fontweight="bold")
-    for axes in grid[len(shown) :]:
-        axes.set_axis_off()
     figure.supxlabel("distance to the category (world units)", fontsize=9)
     figure.supylabel("SSIM", fontsize=9)
     handles = [Line2D([], [], color=c, label=f"level {i:,}") for i, c in zip(levels, shades, strict=True)]
@@ -345,9 +349,7 @@ def panel_strip(panel: Panel, colours: Colours) -> Figure:
     ]
     height, width = panel.photo.shape[:2]
     figure = Figure(figsize=(15, 2.96 * height / width + 0.3))
-    share = (
-        2.96 * height / width / figure.get_figheight()
-    )  # of the figure's height, the rest holds the titles
+    share = 2.96 * height / width / figure.get_figheight()  # the rest holds the titles
     for column, (title, picture) in enumerate(pictures):
         axes = figure.add_axes((column / 5 + 0.001, 0, 0.198, share))
         axes.imshow(picture, aspect="auto")

@@ -1,6 +1,5 @@
 """Figures of where photos were taken, and of what the levels are worth at the viewpoints between them."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sagesplat.adapt.plan import Plan
-from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, Colours, Sizes, caption, ink
+from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, Colours, Sizes, caption, ink, panel_grid
 from sagesplat.output.tables import bytes_of
 
 _DOTS = 30_000  # points on the map
@@ -37,13 +36,9 @@ class Place:
 def camera_map(
     place: Place, quality: Float[np.ndarray, " V"], test: Bool[np.ndarray, " V"], worst: int | None
 ) -> Figure:
-    """The cameras from above, coloured by the SSIM of the full model in their photos.
+    """The cameras from above, coloured by the SSIM of the full model in their photos (`quality`; NaN: none).
 
-    Args:
-        place: Of V cameras.
-        quality: [V], SSIM; NaN where there is none.
-        test: [V], whether the photo is a test view: drawn with a ring.
-        worst: The camera beside which more photos help most; None: none is named.
+    Those of `test` views have a ring, and `worst` a note: beside it more photos help most.
     """
     low, high = _window(place)
     size = high - low
@@ -105,24 +100,15 @@ def fidelity_by_size(
     names: Mapping[int, str],
     colours: Colours,
 ) -> Figure:
-    """Fidelity of each category over the bytes of its levels, at drawn viewpoints; a panel each.
+    """Fidelity of each category over the bytes of its levels, at the V viewpoints that show it; a panel each.
 
-    Args:
-        drawn: By label id, fidelity at the V viewpoints that show the category, at each of the K levels.
-        levels: The K levels.
-        sizes: Bytes to send of each (label id, level).
-        plan: Whose levels are marked.
-        labels: The largest first; the first nine are drawn.
-        names: By label id.
-        colours: By label id.
+    `labels`: the largest first, of which the first nine are drawn; `plan`: whose levels are marked.
     """
     shown = [label for label in labels if label in drawn and len(drawn[label])][:_SHOWN]
     columns = max(1, min(3, len(shown)))
-    lines = max(1, math.ceil(len(shown) / columns))
-    figure = Figure(figsize=(3.2 * columns, 2.1 * lines + 0.6), layout="constrained")
-    grid = figure.subplots(lines, columns, squeeze=False, sharey=True).ravel()
+    figure, grid = panel_grid(len(shown), columns, (3.2, 2.1), 0.6, sharey=True)
     chosen = {choice.label_id: choice for choice in plan.choices}
-    for axes, label in zip(grid, shown, strict=False):
+    for axes, label in zip(grid, shown, strict=True):
         colour = ink(label, colours)
         kilobytes = [sizes[label, level] / 1e3 for level in levels]
         low, middle = np.quantile(drawn[label], [0.05, 0.5], axis=0)
@@ -132,21 +118,10 @@ def fidelity_by_size(
         axes.axhline(plan.target, color=FAINT, lw=1, ls="--")
         if choice := chosen.get(label):
             promised = choice.predicted if np.isfinite(choice.predicted) else low[levels.index(choice.level)]
-            axes.plot(
-                bytes_of(choice) / 1e3,
-                promised,
-                "o",
-                ms=9,
-                mfc="none",
-                mec=ACCENT,
-                mew=2,
-                clip_on=False,
-                zorder=4,
-            )
+            at = bytes_of(choice) / 1e3
+            axes.plot(at, promised, "o", ms=9, mfc="none", mec=ACCENT, mew=2, clip_on=False, zorder=4)
         axes.set_title(caption(label, names), loc="left", color=colour, fontweight="bold")
         axes.set_ylim(max(0.0, float(min(d[:, 0].min() for d in drawn.values())) - 0.05), 1.02)
-    for axes in grid[len(shown) :]:
-        axes.set_axis_off()
     figure.supxlabel("kB to send, level by level", fontsize=9)
     figure.supylabel("fidelity", fontsize=9)
     handles = [

@@ -43,7 +43,10 @@ def write_report(folder: Path, data: ReportData) -> Path:
     labels = tables.by_size(data.counts)
     beside = None if data.ssim_target is None else nearest(data, "ssim", data.ssim_target)
     drawn = report_figures(data, labels, per_block, promises)
-    plots = [(name, title, _save(figure, folder, name)) for name, title, figure in drawn]
+    plots = {
+        name: (title, _address(figures.save_figure(figure, folder / "figures" / name), "image/svg+xml"))
+        for name, title, figure in drawn
+    }
     sheets = dict(_tables(data, labels, per_block, promises))
     for name, table in sheets.items():
         table.write_csv(folder / "tables" / f"{name}.csv")
@@ -61,7 +64,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
         beside_categories=_categories(data, beside, labels, promises) if beside else [],
         num_parts=len(per_block.categories),
         table_rows=TABLE_ROWS,
-        plots={name: (title, image) for name, title, image in plots},
+        plots=plots,
         steps=steps_of(data),
         bundle=next((at for _, at in data.links if at.split("/")[-2:-1] == ["bundle"]), ""),
         qr=qr_address(data.url) if data.url else "",
@@ -120,10 +123,8 @@ def _headline(data: ReportData, promises: Evaluation) -> dict:
     full = sum(tables.last_counts(data.counts).values())
     rows = data.evaluation.of(plan)
     whole = rows.select(rows.label_id == TOTAL)
-    mb, full_mb = (
-        sum(map(bytes_of, plan.choices)) / MB,
-        sum(tables.last_counts(sizes_of(data)).values()) / MB,
-    )
+    mb = sum(map(bytes_of, plan.choices)) / MB
+    full_mb = sum(tables.last_counts(sizes_of(data)).values()) / MB
     saved = 1 - mb / full_mb if full_mb else 0.0
     shares = [c.reached for c in plan.choices if c.reached]
     return {
@@ -209,11 +210,6 @@ def _tables(data: ReportData, labels: Sequence[int], per_block: ReportData, prom
         yield "panels", Table("Views shown above", header, ("", ".3f", ".2f", ".3f", ".2f"), rows)
     if data.timings:
         yield "timings", Table("Time by stage", ("stage", "seconds"), ("", ",.1f"), list(data.timings))
-
-
-def _save(figure: figures.Figure, folder: Path, name: str) -> str:
-    """Save a figure; its SVG as a data address for the page."""
-    return _address(figures.save_figure(figure, folder / "figures" / name), "image/svg+xml")
 
 
 def _pictures(panel: Panel, colours: Colours, photos: bool) -> dict:

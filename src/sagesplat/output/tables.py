@@ -16,6 +16,7 @@ from sagesplat.output.table import Table
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_NAME
 
 MB = 1e6  # bytes
+_COLUMNS = 4  # of a ladder in a terminal
 
 
 @dataclass(frozen=True)
@@ -88,12 +89,12 @@ def counts_table(counts: Counts, labels: Sequence[int], names: Mapping[int, str]
 
 
 def ladder_table(
-    rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str], columns: int = 4
+    rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str]
 ) -> Table:
     """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some levels."""
     levels = sorted({level for _, level in counts})
     not_recovering = [level for level in levels if level not in recovering] or levels
-    spread = np.linspace(0, len(not_recovering) - 1, columns).round().astype(int)
+    spread = np.linspace(0, len(not_recovering) - 1, _COLUMNS).round().astype(int)
     picked = sorted({not_recovering[i] for i in spread})
     body = []
     for label_id in [*by_size(counts), TOTAL]:
@@ -140,15 +141,8 @@ def plan_table(plan: Plan, counts: Counts, names: Mapping[int, str]) -> Table:
     for choice in sorted(plan.choices, key=lambda c: -full.get(c.label_id, 0)):
         share = choice.count / full[choice.label_id] if full.get(choice.label_id) else math.nan
         sent = math.nan if choice.transfer_bytes is None else choice.transfer_bytes / MB
-        cells = (
-            choice.level,
-            choice.count,
-            share,
-            sent,
-            choice.nbytes / MB,
-            choice.distance,
-            choice.predicted,
-        )
+        cells = (choice.level, choice.count, share, sent, choice.nbytes / MB)
+        cells += (choice.distance, choice.predicted)
         of = choice.reached
         views = (of.share, of.low, of.high, of.num_views) if of else (math.nan,) * 4
         body.append((name_of(choice.label_id, names), *cells, *views, choice.verdict))

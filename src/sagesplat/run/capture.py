@@ -27,7 +27,7 @@ class Capture:
     path: Path
     settings: dict[str, Any]  # of `SceneConfig`: how it is read; none for a stored scene
     fingerprint: str
-    photos: dict[str, str] | None = None  # SHA-256 by name
+    photos: dict[str, str]  # SHA-256 by name
     vignetting: Vignetting | None = None  # that was found in the photos, where it was looked for
 
     def __post_init__(self) -> None:

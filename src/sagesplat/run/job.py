@@ -97,10 +97,10 @@ class Job:
             self._refined = state, with_cameras(given, read_refined(path, len(given.views)))
         return self._refined[1]
 
-    @property
+    @cached_property
     def given_scene(self) -> Scene:
         """The capture that scene.json names, unchanged since, with its cameras as they were given."""
-        return self._opened[0]
+        return self.source.given_scene if self.source else self._opened[0]
 
     @cached_property
     def photos(self) -> Photos:
@@ -120,10 +120,9 @@ class Job:
             raise RunError(
                 f"{made.path}: the capture changed since this run began; choose another run folder"
             )
-        if made.photos is not None:
-            now = photo_hashes(self.run.photo_hashes, scene)
-            check_photos(scene, made.photos, now.sha256)
-            now.keep()
+        now = photo_hashes(self.run.photo_hashes, scene)
+        check_photos(scene, made.photos, now.sha256)
+        now.keep()
         return scene, Photos(scene.views, memory.photo_cache(self.memory_limit))
 
     @property

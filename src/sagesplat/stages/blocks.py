@@ -108,11 +108,8 @@ def _begin(run: RunDir, scene: Scene, labels: LiftedLabels, rows: np.ndarray, ph
     write_scene(capture, scene)
     labels.select(rows).write(run.labels)
     mine = photos.of({view.name for view in scene.views})
-    stored: dict[str, Any] = {
-        "path": str(capture.resolve()),
-        "settings": {},
-        "fingerprint": fingerprint(scene),
-    }
+    stored: dict[str, Any] = {"path": str(capture.resolve()), "settings": {}}
+    stored |= {"fingerprint": fingerprint(scene)}
     stored |= {"photos": mine.sha256, "extent": scene.extent, "points": len(rows), "views": []}
     write_json(run.scene, stored)
     mine.keep(run.photo_hashes)

@@ -39,11 +39,7 @@ from sagesplat.stages.results import (
 )
 from sagesplat.stages.shared import category_and_block
 from sagesplat.viewer.built import check_viewer, package_viewer
-from sagesplat.viewer.bundle import (
-    BundleSizes,
-    check_target,
-    write_bundle,
-)
+from sagesplat.viewer.bundle import BundleSizes, check_target, write_bundle
 from sagesplat.viewer.corrections import distance_error, with_corrections
 from sagesplat.viewer.frames import camera_at
 from sagesplat.viewer.manifest import Category, Contents, start_of
@@ -116,7 +112,7 @@ def bundle(
         chunks=listed,
         meters_per_unit=meters_per_unit,
         drawn=[drawn.cameras[row] for row in drawn.rows("fit")],
-        target=_target(job),
+        target=main_target(job.run) if job.run.plan.exists() else None,
         ladder=ladder_hash(listed, job.names()),
         hidden=edited.hidden,
     )
@@ -156,7 +152,7 @@ def _in_streams(listed: Sequence[Increment]) -> bool:
 def _without_capture(job: Job) -> Job:
     """The job with the cameras and points that the run kept: its capture may be gone or changed since."""
     source = replace(job)
-    vars(source)["given_scene"] = read_scene(job.run.geometry)
+    source.given_scene = read_scene(job.run.geometry)
     return replace(job, source=source)
 
 
@@ -211,10 +207,7 @@ def _check_asked(
 def _with_quality(
     job: Job, categories: Sequence[Category], always: Collection[str], weights: Mapping[str, float]
 ) -> list[Category]:
-    models: dict[QualityKind, dict[int, ViewModel]] = {
-        "fidelity": fidelity_of(job),
-        "ssim": promises_of(job),
-    }
+    models: dict[QualityKind, dict[int, ViewModel]] = {"fidelity": fidelity_of(job), "ssim": promises_of(job)}
     seen: dict[QualityKind, dict[int, Seen]] = {
         "fidelity": _seen_from_drawn(job),
         "ssim": _seen_in_photos(job) if has_photos(job.run) else {},
@@ -229,11 +222,6 @@ def _with_quality(
         )
         for category in categories
     ]
-
-
-def _target(job: Job) -> tuple[QualityKind, float] | None:
-    """What the run's plan leads with; None without a plan."""
-    return main_target(job.run) if job.run.plan.exists() else None
 
 
 def _seen_in_photos(job: Job) -> dict[int, Seen]:

@@ -39,18 +39,9 @@ def clean_splat(
 ) -> CleanFigures:  # fmt: skip
     """Write a splat without its floaters; what stays is as it was.
 
-    Args:
-        source: The splat file, or the folder of a SOG.
-        out: A .ply, .spz or .sog. From PLY to PLY rows are copied with all their properties.
-        config: Thresholds. "keep" is refused.
-        emit: Hears of progress, and gets the result in words.
-        cameras: Where its photos were taken from: a capture with or without photos, or a file of cameras;
-            None: viewpoints are drawn; what few views or hardly any show is then no criterion.
-        picture: PNG of views before and after.
-        backend: Rasteriser.
-
-    Raises:
-        SageError: For a file that cannot be read or written, or cameras that do not fit the splat.
+    From PLY to PLY rows are copied with all their properties. `cameras`: where its photos were taken from, a
+    capture with or without photos, or a file of cameras; None: viewpoints are drawn, and what few views or
+    hardly any show is then no criterion. `picture`: PNG of views before and after.
     """
     check_limits(config, "clean.")
     _check_paths(source, out, picture, config)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from sagesplat.adapt.plan import Plan
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.ply import write_ply
 from sagesplat.raster.classic import for_classic
@@ -30,11 +29,6 @@ def tune_composition(job: Job, g: Gaussians, steps: int) -> Gaussians:
     )  # fmt: skip
 
 
-def compose(job: Job, plan: Plan) -> Gaussians:
-    """The composition of a plan."""
-    return job.ladder.compose(plan.levels)
-
-
 def classic(job: Job, g: Gaussians) -> Gaussians:
     """`g` for viewers that draw without antialiasing, whatever the run was trained with."""
     if not job.antialiased:
@@ -49,7 +43,7 @@ def compose_plan(job: Job) -> None:
 
     def make() -> list[str]:
         plan = main_plan(job)
-        g = compose(job, plan)
+        g = job.ladder.compose(plan.levels)
         write_ply(run.composed, classic(job, g), job.names(), parents=job.parents_by_id)
         size = f"{plan.nbytes / 1e6:.1f} MB at 248 bytes each"
         if plan.transfer_bytes is not None:

@@ -12,7 +12,7 @@ from sagesplat.output import tables
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
-from sagesplat.stages.compose import compose, compose_inputs
+from sagesplat.stages.compose import compose_inputs
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.results import budget_plan_of, plans_of
@@ -28,7 +28,7 @@ def evaluate_plans(job: Job) -> None:
         table = evaluate(
             job.scene, job.photos, job.level_masks, job.ladder, plans, method.predicted,
             uniform=_levels_beside(job, plans),
-            compose=lambda plan: compose(job, plan), valid=job.valid,
+            compose=lambda plan: job.ladder.compose(plan.levels), valid=job.valid,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip

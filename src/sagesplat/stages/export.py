@@ -27,7 +27,7 @@ from sagesplat.formats.splats import write_splat, writer_of
 from sagesplat.raster import device_of, rasterize
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
-from sagesplat.stages.compose import classic, compose
+from sagesplat.stages.compose import classic
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import labels_named
@@ -104,7 +104,8 @@ def export_scene(
     if level is not None:
         whole = job.ladder.load(level)
     else:
-        whole = compose(job, main_plan(job) if target is None else scene_plan(job, *target))
+        plan = main_plan(job) if target is None else scene_plan(job, *target)
+        whole = job.ladder.compose(plan.levels)
     g = whole.of_labels(wanted)
     if gone:
         job.emit(Warned(_holes(job, whole, g, without)))

@@ -24,13 +24,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.detect import VALID_FOLDER
 from sagesplat.segment.display_names import categories, title_of, titles
-from sagesplat.segment.edit import (
-    Edited,
-    edit_labels,
-    ignored_ids,
-    parse_merge,
-    parse_names,
-)
+from sagesplat.segment.edit import Edited, edit_labels, ignored_ids, parse_merge, parse_names
 from sagesplat.segment.lift import agreement_in, lift
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, write_labels
@@ -104,13 +98,8 @@ def _find_valid(
     ids, unseen = ignored_ids(before, ignore, merge)
     if unseen:
         job.emit(Warned(f"ignore: no photo shows {', '.join(unseen)}"))
-    shares = write_valid(
-        job.scene,
-        run.valid,
-        label_ids=Masks(run.segmented, before),
-        ignore=ids,
-        dilation=_DILATION,
-    )
+    label_ids = Masks(run.segmented, before)
+    shares = write_valid(job.scene, run.valid, label_ids=label_ids, ignore=ids, dilation=_DILATION)
     if empty := [view.name for view, share in zip(views, shares, strict=True) if share == 1]:
         names = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
         job.emit(Warned(f"{len(empty)} of {len(views)} photos have no pixel that counts: {names}"))

@@ -58,28 +58,10 @@ class LabelsApplied:
 def apply_labels(
     job: Job, edits: Path | None = None, out: Path | None = None, *, viewer: Path | None = None
 ) -> LabelsApplied:
-    """Make a new run of a finished one, with edited categories, and its bundle. The run stays as it is.
+    """Make a new run of a finished one, with edited categories, and its bundle: `sagesplat.apply_labels`.
 
-    Args:
-        job: The run, finished with nested levels in coded streams.
-        edits: labels.edit.json; by default that of the run folder, where `sagesplat view --edit` puts it.
-        out: The new run folder; by default RUN-edited. An earlier edited run is replaced as a whole.
-        viewer: The built viewer; by default the package's own.
-
-    Returns:
-        What was made.
-
-    Raises:
-        LabelError: For edits that are damaged, of another run, or that cannot be applied.
-        RunError: For a run that is not finished, is in blocks or has levels that replace those below, and for
-            an `out` that holds something else.
-
-    Example:
-        >>> from sagesplat.run.job import Job
-        >>> from sagesplat.run.run_dir import RunDir
-        >>> from sagesplat.stages.label_edits import apply_labels
-        >>> job = Job(RunDir(Path("runs/garden")), print)  # doctest: +SKIP
-        >>> apply_labels(job, Path("labels.edit.json")).path  # doctest: +SKIP
+    The run stays as it is. RunError also for a run in blocks or with levels that replace those below, where
+    the edits do more than hide, weigh and keep in full. `viewer`: the built one; None: the package's own.
     """
     path = edits or job.run.path / FILE
     out = (out or job.run.path.resolve().with_name(f"{job.run.path.resolve().name}-edited")).resolve()

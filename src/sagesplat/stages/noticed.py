@@ -38,7 +38,7 @@ def _ignored(job: Job) -> float:
 
 def _removed(figures: CleanFigures) -> list[str]:
     """Floaters that were removed, apart from what nobody sees anyway."""
-    unseen = figures.removed.get("few views", 0)
+    unseen = figures.removed.get("hardly shown", 0)
     floaters = sum(figures.removed.values()) - unseen
     words = [
         (floaters, f"{floaters:,} floater{'s' if floaters > 1 else ''} removed"),

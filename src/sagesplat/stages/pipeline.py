@@ -54,20 +54,9 @@ WILD_DEMO = replace(
 
 
 def run_all(job: Job, scene: Path, config: RunConfig) -> None:
-    """Run every stage on one capture. Stages whose results are there already are skipped.
+    """Run every stage on one capture (see `sagesplat.run_scene`), but for those whose results are there.
 
-    Args:
-        job: The run folder, and where events go. Results for the paper's levels or for the nested ladder go
-            to folders of their own: `job.run.ladder`.
-        scene: The capture.
-        config: Settings of all stages.
-
-    Raises:
-        SageError: For anything wrong with the capture, the settings, the run folder or the machine. Settings
-            are checked before hours of training.
-
-    Example:
-        `sagesplat.run_scene` opens a job and calls this.
+    Results for the paper's levels or for the nested ladder go to folders of their own: `job.run.ladder`.
     """
     check_not_adopted(job.run)
     check_limits(config)  # before hours of training
@@ -102,14 +91,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
 def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> None:
     """Make a run of a splat that somebody else trained: levels, promises, a plan and a report.
 
-    Args:
-        job: The run folder, and where events go.
-        source: The splat file, or the folder of a SOG.
-        adopted: Viewpoints and levels.
-        config: Settings of the other stages; those of training and nesting are not used.
-
-    Raises:
-        SageError: For anything wrong with the file, the settings, the run folder or the machine.
+    `source`: the splat file, or the folder of a SOG. Of `config` training and nesting are not used.
     """
     check_limits(config)
     check_targets(config.plan, "nested")

@@ -9,7 +9,6 @@ from sagesplat.formats.ply import read_ply
 from sagesplat.output.tables import MB, bytes_of, last_counts, mean
 from sagesplat.run.job import Job
 from sagesplat.run.stage import run_stage
-from sagesplat.stages.compose import compose
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.noticed import noticed
 from sagesplat.stages.plan import main_target, scene_plan
@@ -17,16 +16,7 @@ from sagesplat.stages.results import budget_plan_of, evaluation_of
 
 
 def make_report(job: Job, url: str = "") -> None:
-    """Write the report.
-
-    Args:
-        job: The run folder, and where events go.
-        url: Address at which the run's bundle was published: the page links to it, with a QR code.
-
-    Raises:
-        RunError: For an address that is none of http or https, or results that are missing or do not belong
-            together.
-    """
+    """Write the report; it links to `url`, where the run's bundle was published, with a QR code."""
     # loads matplotlib, for which no training has to wait
     from sagesplat.output.report import write_report
     from sagesplat.stages.report_data import links, report_data, stage_records
@@ -40,7 +30,8 @@ def make_report(job: Job, url: str = "") -> None:
         # the page leads with a target: what was composed for a budget is not what it is about; and what was
         # written for other viewers is not drawn as the run draws
         other = budget_plan_of(job) is not None or job.antialiased
-        composed = compose(job, scene_plan(job, quality, target)) if other else read_ply(run.composed)
+        plan = scene_plan(job, quality, target)
+        composed = job.ladder.compose(plan.levels) if other else read_ply(run.composed)
         write_report(run.report, report_data(job, composed, quality, target, found, url))
         return []
 

@@ -122,18 +122,12 @@ def _adopted(job: Job, ladder: PrefixLadder) -> list[tuple[str, str]]:
     originals = ", ".join(f"{titled} {level}" for titled, level in first.items())
     return [
         ("file", Path(made["source"]).name),
-        (
-            "viewpoints",
-            made["cameras"] or f"{made['views']} drawn from the splat, kind {made['kind']}",
-        ),
+        ("viewpoints", made["cameras"] or f"{made['views']} drawn from the splat, kind {made['kind']}"),
         ("compared with", "photos" if made["photos"] else "renders of the splat as it came in"),
         ("labels", "those of the file, if it has any" if made["labelled"] else "votes of label images"),
         ("lower levels", trained if nest["fit"] == "renders" else "merged Gaussians, not trained"),
         ("originals from level", originals or "1"),
-        (
-            "last level",
-            "identical to the file" if nest["lossless"] else "the file, rounded as SPZ",
-        ),
+        ("last level", "identical to the file" if nest["lossless"] else "the file, rounded as SPZ"),
     ]
 
 
@@ -174,9 +168,7 @@ def _commands(job: Job) -> Commands:
 
 def links(run: RunDir) -> list[tuple[str, str]]:
     """What else was made of a run, by title: addresses relative to its report."""
-    pages = [
-        ("Its bundle, for any static web server", run.path / "bundle"),
-    ]
+    pages = [("Its bundle, for any static web server", run.path / "bundle")]
     pages += [
         (f"The paper's tables and figures, --ladder {kind}", RunDir(run.path, kind).paper)
         for kind in get_args(LadderKind)
@@ -223,8 +215,7 @@ def picture_panels(job: Job, composed: Gaussians) -> list[Panel]:
     full = ladder.load(ladder.levels[-1])
     panels = []
     for row in rows.tolist():
-        view = scene.views[row]
-        photo = photos[row]
+        view, photo = scene.views[row], photos[row]
         images = [
             render_rgb(g, view.camera, backend=job.backend, antialiased=job.antialiased)
             for g in (full, composed)

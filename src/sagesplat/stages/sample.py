@@ -5,12 +5,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from sagesplat.adapt.fidelity import (
-    SampledFidelity,
-    distances_at,
-    measure_levels,
-    write_sampled,
-)
+from sagesplat.adapt.fidelity import SampledFidelity, distances_at, measure_levels, write_sampled
 from sagesplat.adapt.fidelity_models import NOMINAL, fit_fidelity
 from sagesplat.adapt.viewpoints import (
     Rule,
@@ -85,11 +80,8 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
     base_steps = nest["base_steps"] if nest["base_share"] else 0
     renders = _RENDERS * (train["max_steps"] + nest["steps"] + base_steps)
     compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice, for the bias three times
-    cost = {
-        "fit": len(job.ladder.levels) + _LABEL_IMAGE,
-        "bias": 1.5 * compositions,
-        "calibration": compositions,
-    }
+    levels = len(job.ladder.levels)
+    cost = {"fit": levels + _LABEL_IMAGE, "bias": 1.5 * compositions, "calibration": compositions}
     part = renders / sum(DEFAULT_COUNTS[name] * cost[name] for name in DEFAULT_COUNTS)
     counts = {name: max(int(min(part, 1) * DEFAULT_COUNTS[name]), _FEWEST[name]) for name in DEFAULT_COUNTS}
     left = renders - sum(counts[name] * cost[name] for name in counts)

@@ -11,14 +11,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.names import repaired
 from sagesplat.io.files import write_json
-from sagesplat.run.capture import (
-    Capture,
-    Hashes,
-    check_photos,
-    fingerprint,
-    photo_hashes,
-    read_capture,
-)
+from sagesplat.run.capture import Capture, Hashes, check_photos, fingerprint, photo_hashes, read_capture
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 from sagesplat.run.run_dir import RunDir
@@ -85,9 +78,8 @@ def open_scene(
     scene = begun.load() if begun and again else load_scene(path, **asdict(config))
     photos, found = photo_hashes(run.photo_hashes, scene), scene.views[0].vignetting
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
-    if begun is None or begun.photos is not None or begun.fingerprint != settings["fingerprint"]:
-        settings["photos"] = photos.digest
-    if begun and same and begun.photos is not None:
+    settings["photos"] = photos.digest
+    if begun and same:
         check_photos(scene, begun.photos, photos.sha256)
 
     def make() -> list[str]:
@@ -124,10 +116,8 @@ def open_scene(
             lines.append(_of_lens(found))
         return lines
 
-    run_stage(job, "scene", settings, [], [run.scene], make)
+    run_stage(job, "scene", settings, [], [run.scene, run.geometry], make)
     photos.keep()
-    if not run.geometry.exists():  # the run began before it was kept
-        _write_geometry(run.geometry, scene)
 
 
 def _downscale(job: Job, path: Path, begun: Capture | None) -> int:
@@ -175,11 +165,6 @@ def _write_geometry(path: Path, scene: Scene) -> None:
 
 HIGH_ERROR = 0.8  # px; `dinosaur` has 0.97 with one shared camera, 0.42 with a camera per photo
 _POSES = ("prepare", "features", "matches", "mapping", "undistortion")
-
-
-def _poses_progress(stage: str, done: float) -> Progress:
-    """One progress bar for all stages of structure from motion; mapping may restart with another model."""
-    return Progress("poses", round(100 * (_POSES.index(stage) + done)), 100 * len(_POSES), stage)
 
 
 @dataclass(frozen=True)
@@ -234,10 +219,13 @@ def _find_poses(job: Job, source: Path, capture: Path, config: PosesConfig, leav
         **leaving_out.settings,
     }
 
+    def progress(stage: str, done: int, total: int) -> None:  # one bar for all; mapping may begin again
+        reached = _POSES.index(stage) + done / max(total, 1)
+        job.emit(Progress("poses", round(100 * reached), 100 * len(_POSES), stage))
+
     def make() -> list[str]:
         result = reconstruct(
-            source, capture, config,
-            lambda stage, done, total: job.emit(_poses_progress(stage, done / max(total, 1))),
+            source, capture, config, progress,
             device="cpu" if job.device == "cpu" else "auto", threads=job.threads or -1,
             alpha=leaving_out.scene.alpha, ignored=leaving_out.of_photos(),
         )  # fmt: skip

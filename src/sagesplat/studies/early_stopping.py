@@ -6,14 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import (
-    TOTAL,
-    Observations,
-    as_unit,
-    measure,
-    near_border,
-    render_rgb,
-)
+from sagesplat.adapt.observe import TOTAL, Observations, as_unit, measure, near_border, render_rgb
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import psnr, squared_error_map

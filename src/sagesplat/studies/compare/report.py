@@ -16,7 +16,7 @@ from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
 from sagesplat.core.limits import Count, NumberOrNaN
 from sagesplat.io.files import write_json, write_text
 from sagesplat.io.typed import read_json_as
-from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, caption, save_figure
+from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, caption, panel_grid, save_figure
 from sagesplat.output.table import Table
 from sagesplat.output.tables import MB
 
@@ -326,18 +326,13 @@ def label_curves(points: Sequence[Point], names: Mapping[int, str]) -> Figure:
         if np.isfinite(of.ssim):
             largest[label] = max(of.encoded, largest.get(label, 0))
     labels = sorted(largest, key=lambda label: (-largest[label], label))[:_PANELS]
-    columns = max(1, min(4, len(labels)))
-    lines = max(1, math.ceil(len(labels) / columns))
-    figure = Figure(figsize=(3.1 * columns, 2.4 * lines + 0.5), layout="constrained")
-    grid = figure.subplots(lines, columns, squeeze=False).ravel()
-    for axes, label in zip(grid, labels, strict=False):
+    figure, grid = panel_grid(len(labels), max(1, min(4, len(labels))), (3.1, 2.4), 0.5)
+    for axes, label in zip(grid, labels, strict=True):
         for method in methods:
             own = [(p, p.labels[label]) for p in _of(points, method) if label in p.labels]
             _line(axes, method, [(p, of.encoded / MB, of.ssim) for p, of in own])
         _sizes(axes)
         axes.set_title(caption(label, names), loc="left", fontweight="bold")
-    for axes in grid[len(labels) :]:
-        axes.set_axis_off()
     figure.supxlabel("MB of the category, encoded", fontsize=9)
     figure.supylabel("SSIM of the category, test views", fontsize=9)
     _legend(figure, points, methods)

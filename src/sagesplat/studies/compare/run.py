@@ -304,12 +304,7 @@ def planned_within(
     """
     found, seen = [], []
     for name, nbytes in budgets:
-        config = (
-            PlanConfig(budget=nbytes)
-            if target_ssim is None
-            else PlanConfig(target_ssim=target_ssim, budget=nbytes)
-        )
-        plan = nested.plan_budget(config)
+        plan = nested.plan_budget(PlanConfig(target_ssim=target_ssim, budget=nbytes))
         if plan.levels not in seen:
             seen.append(plan.levels)
             found.append(_of_plan(nested, name, plan))
@@ -336,13 +331,11 @@ def measure_sets(job: Job, contenders: Sequence[Contender], metrics: dict[str, L
         return job.scene.views[row].camera.exposure is not None
 
     def image_of(g: Gaussians, row: int, neutral: bool = False) -> np.ndarray:
-        drawn: dict[str, Any] = {
-            "backend": job.backend,
-            "antialiased": job.antialiased,
-            "workspace": workspace,
-        }
         camera = job.scene.views[row].camera
-        return render_rgb(g, camera.neutral if neutral else camera, **drawn)
+        return render_rgb(
+            g, camera.neutral if neutral else camera,
+            backend=job.backend, antialiased=job.antialiased, workspace=workspace,
+        )  # fmt: skip
 
     for begin in range(0, len(contenders), _TOGETHER):
         some = contenders[begin : begin + _TOGETHER]

@@ -47,13 +47,8 @@ class Level:
 def levels_of(path: Path) -> list[Level]:
     """The levels at a path, the finest first; a file of one splat is one level.
 
-    Args:
-        path: A splat file of any format, a folder or lod-meta.json of streamed SOG, a bundle, or a finished
-            run folder. Level k of a bundle or a run is level k of every category.
-
-    Raises:
-        DataError: Where there is none, or its description is damaged.
-        RunError: For a run without levels.
+    `path`: a splat file of any format, a folder or lod-meta.json of streamed SOG, a bundle, or a finished run
+    folder. Level k of a bundle or a run is level k of every category. DataError where there is none.
     """
     name = repaired(path.name or path.resolve().name)
     if path.is_dir() and is_bundle(path):

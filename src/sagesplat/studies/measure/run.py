@@ -35,20 +35,11 @@ from sagesplat.studies.measure.score import Renderer, compare
 def measure(
     paths: Sequence[Path], out: Path, config: MeasureConfig, emit: Emit, backend: Backend = "cpu"
 ) -> Measured:
-    """Measure levels against their scene; write tables, curves and viewpoints to `out`.
+    """Measure levels against their scene; write tables, curves and viewpoints to the folder `out`.
 
-    Args:
-        paths: The reference, and what is measured against it: each as `levels.levels_of` takes it. One path:
-            its finest level is the reference of its others. Of several, all levels of all but the first are
-            measured, against the finest of the first.
-        out: Folder for levels.csv, views.csv, measure.json, measure.png and .svg, viewpoints.png.
-        config: Viewpoints and metrics.
-        emit: Hears of progress and gets the tables.
-        backend: Of the renders.
-
-    Raises:
-        DataError: For a file that cannot be read.
-        RunError: For one level alone, and where no viewpoint has anything in sight.
+    `paths`, as `levels.levels_of` takes them: of one, its finest level is the reference of its others; of
+    several, all levels of all but the first are measured against the finest of the first. RunError for one
+    level alone, and where no viewpoint has anything in sight.
     """
     emit(StageStarted("measure"))
     check_limits(config)

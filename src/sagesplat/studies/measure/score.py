@@ -47,12 +47,9 @@ class Renderer:
     def rgb(self, splat: Splat, camera: Camera) -> Float32[np.ndarray, "H W 3"]:
         """An image in [0, 1]."""
         return render_rgb(
-            splat.gaussians,
-            camera,
-            backend=self.backend,
-            antialiased=splat.antialiased,
-            workspace=self.workspace,
-        )
+            splat.gaussians, camera,
+            backend=self.backend, antialiased=splat.antialiased, workspace=self.workspace,
+        )  # fmt: skip
 
     @torch.no_grad()
     def covered(self, splat: Splat, camera: Camera) -> np.ndarray:
@@ -68,20 +65,12 @@ def compare(
     cameras: Sequence[Camera],
     metrics: Mapping[str, Lpips],
     renderer: Renderer,
-    done: Callable[[int], None] = lambda images: None,
+    done: Callable[[int], None],
 ) -> tuple[list[Row], list[int]]:
-    """Measure levels in all viewpoints.
+    """Measure levels in all viewpoints: the measurements, and the number of Gaussians of each level.
 
-    Args:
-        reference: What they are levels of. Its labels say where the categories are.
-        levels: Loaded some at a time.
-        cameras: Viewpoints.
-        metrics: LPIPS by column.
-        renderer: Draws.
-        done: Called with the number of images that were compared.
-
-    Returns:
-        The measurements, and the number of Gaussians of each level.
+    The labels of `reference` say where the categories are; `metrics`: LPIPS by column; `done` hears how many
+    images were compared.
     """
     rows: list[Row] = []
     counts: list[int] = []

@@ -16,12 +16,7 @@ from sagesplat.io.typed import convert_as, read_toml, refused
 MAX_LENGTH = 2**20  # characters of a file
 MAX_RUNS = 10_000
 BUILT_IN = "demo"  # as a scene's path: the built-in capture
-_SET_BY = {
-    "seed": "seeds",
-    "target_ssim": "targets",
-    "target_fidelity": "targets",
-    "other_targets": "targets",
-}
+_SET_BY = dict.fromkeys(("target_ssim", "target_fidelity", "other_targets"), "targets") | {"seed": "seeds"}
 _Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.+-]{0,99}\Z")]  # also of a folder
 
 

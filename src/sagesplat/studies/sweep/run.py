@@ -141,7 +141,7 @@ def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
     if old.capture.exists() or old.blocks.exists():  # these are named in there
         return
     stages = [old.provenance(stage) for stage in ("scene", "segment", "masks", "lift", "train", "clean")]
-    made = [old.scene, old.segmented, old.masks, old.labels]
+    made = [old.scene, old.geometry, old.segmented, old.masks, old.labels]
     made += [old.levels, old.checkpoint, old.cap, old.frozen, old.cameras, old.refined, old.inliers]
     made += [old.sky, old.cleaned, old.floaters, old.floaters_picture, *stages]
     with atomic_folder(new.path) as fresh:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sagesplat.core.names import repaired
-from sagesplat.output.figures import FAINT, INK, STYLE, shortened
+from sagesplat.output.figures import FAINT, INK, STYLE, panel_grid, shortened
 from sagesplat.output.table import Table
 from sagesplat.output.tables import mean
 from sagesplat.segment.display_names import titles
@@ -83,11 +83,9 @@ def transfer_figure(a: FittedRun, b: FittedRun) -> Figure:
     found = shared_categories(a, b)
     shown = _shown([shared.name for shared in found])
     columns = min(3, math.ceil(math.sqrt(len(found))))
-    lines = math.ceil(len(found) / columns)
-    figure = Figure(figsize=(3.6 * columns, 2.6 * lines + 0.4 + 1.4 / columns), layout="constrained")
-    grid = figure.subplots(lines, columns, squeeze=False).ravel()
+    figure, grid = panel_grid(len(found), columns, (3.6, 2.6), 0.4 + 1.4 / columns)
     rows = b.observations.select(np.isfinite(b.observations.distance))
-    for axes, shared in zip(grid, found, strict=False):
+    for axes, shared in zip(grid, found, strict=True):
         mine = rows.select((rows.label_id == shared.label_b) & (rows.level == shared.levels[-1]))
         test = np.isin(mine.view, b.test_views)
         axes.plot(mine.distance[~test], mine.ssim[~test], ".", color=FAINT, ms=4, alpha=0.6, mew=0)
@@ -106,8 +104,6 @@ def transfer_figure(a: FittedRun, b: FittedRun) -> Figure:
             for part, alpha in ((fitted, 1.0), (~fitted, 0.3)):
                 ssim = np.where(part, model(d), np.nan)
                 axes.plot(distance, ssim, color=colour, lw=width, alpha=alpha, solid_capstyle="butt")
-    for axes in grid[len(found) :]:
-        axes.set_axis_off()
     of_a, of_b = (shortened(repaired(Path(run.name).resolve().name, "run")) for run in (a, b))
     figure.supxlabel(f"distance to the category in {of_b} (world units)", fontsize=9)
     figure.supylabel("SSIM", fontsize=9)
