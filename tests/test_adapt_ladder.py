@@ -58,10 +58,7 @@ def test_a_ladder_without_second_opacities(tmp_path):
 @pytest.mark.parametrize(
     "second",
     [
-        SecondOpacities(SECOND.logits[:-1], SECOND.weights),
         SecondOpacities(SECOND.logits.clone().fill_(torch.nan), SECOND.weights),
-        SecondOpacities(SECOND.logits, {0: (0, 0, 1)}),
-        SecondOpacities(SECOND.logits, WEIGHTS | {7: (0, 1)}),
         SecondOpacities(SECOND.logits, WEIGHTS | {7: (0, 1, 1.5)}),
     ],
 )  # fmt: skip

@@ -40,16 +40,6 @@ def test_leaving_one_out_in_closed_form_is_what_a_fit_without_the_view_says():
         np.testing.assert_allclose(process.left_out_spread[i], spread, rtol=1e-6)
 
 
-def test_kernel_written_out():
-    x, _, _ = drawn(5)
-    lengths = (0.8, 1.2, 2.0)
-    for i in range(5):
-        for j in range(5):
-            r2 = sum(((x[i, g] - x[j, g]) ** 2).sum() / ll**2 for g, ll in zip(GROUPS, lengths, strict=True))
-            a = np.sqrt(3 * r2)
-            assert matern32(x, x, lengths)[i, j] == pytest.approx((1 + a) * np.exp(-a), abs=1e-12)
-
-
 def test_slopes_of_the_covariance():
     x, u, _ = drawn(6)
     theta, squares = PRIOR + 0.3, squares_of(x)

@@ -11,7 +11,7 @@ from sagesplat.adapt.bound_plans import Costs, pooled
 from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels, reached
 from sagesplat.core.errors import RunError
 
-quick = settings(max_examples=80, deadline=None)
+quick = settings(max_examples=80)
 
 
 def costs(labels: int, levels: int) -> Costs:

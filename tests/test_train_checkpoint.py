@@ -100,7 +100,6 @@ def test_not_finite_is_refused(tmp_path, name):
 )  # np.load leaves such files open
 @settings(
     max_examples=100,
-    deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )

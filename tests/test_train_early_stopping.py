@@ -102,24 +102,6 @@ def test_frozen_categories_stay_bit_for_bit(capture, levels, tmp_path):
     assert not np.array_equal(rows_of(levels[110], free), rows_of(levels[120], free))
 
 
-def test_a_category_stops_at_the_first_level_that_reaches_the_target(capture, levels, tmp_path):
-    scene, photos, masks, labels = capture
-    config = replace(CONFIG, freeze_at=0.45, max_steps=40)
-    events = list(train(scene, photos, labels, config, masks=masks, folder=tmp_path))
-    first = min(e.step for e in events if isinstance(e, LabelFrozen))
-    for step in sorted(levels):
-        degree = min(3, step // round(1000 * 40 / 30_000))
-        quality = measured(levels[step], capture, degree)
-        reached = {
-            label for label, ssim in quality.items() if ssim >= 0.45 and label in levels[step].counts()
-        }
-        if step < first:
-            assert not reached
-        if step == first:
-            assert reached == {e.label_id for e in events if isinstance(e, LabelFrozen) and e.step == first}
-            break
-
-
 def test_training_ends_when_every_category_has_stopped(capture, levels, tmp_path):
     scene, photos, masks, labels = capture
     config = replace(CONFIG, freeze_at=0.02)
@@ -148,11 +130,8 @@ def test_a_killed_run_keeps_what_was_frozen(capture, tmp_path):
     assert [e for e in again if isinstance(e, LabelFrozen)] == late
 
 
-@pytest.mark.parametrize("target", [0.0, -1.0, 1.5, float("nan")])
-def test_impossible_targets_are_one_line(capture, target):
-    scene, photos, masks, labels = capture
-    with pytest.raises(RunError, match=r"--train.freeze-at .* is impossible; choose a number above 0 to 1"):
-        next(train(scene, photos, labels, replace(CONFIG, freeze_at=target), masks=masks))
+def test_a_target_needs_label_images(capture):
+    scene, photos, _, labels = capture
     with pytest.raises(RunError, match="needs label images"):
         next(train(scene, photos, labels, replace(CONFIG, freeze_at=0.5)))
 
@@ -195,7 +174,7 @@ def test_tiles_with_only_stopped_categories_are_done():
     assert active_tiles(labels, {3}, 4).tolist() == [[True]]
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50, derandomize=True)
 @given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4]), st.integers(0, 99))
 def test_masks_of_tiles_fit_photos_of_any_size(height, width, factor, seed):
     labels = np.random.default_rng(seed).integers(-1, 2, (height, width)).astype(np.int16)

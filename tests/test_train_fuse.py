@@ -50,10 +50,6 @@ def _truth(g: Gaussians, scene: Scene) -> list[Int16[np.ndarray, "H W"]]:
     return [IDS[drawn.argmax(0).clip(1)] for drawn in _drawn_labels(g, scene)]
 
 
-def _one_hot(label_ids: Int16[np.ndarray, "H W"]) -> Float32[np.ndarray, "K H W"]:
-    return (label_ids == IDS[1:, None, None]).astype(np.float32)
-
-
 def test_hard_votes_are_the_weights_of_the_labels_in_shares(tmp_path: Path) -> None:
     g, scene = _scene()
     masks = _write(tmp_path, scene, _truth(g, scene))
@@ -68,16 +64,6 @@ def test_hard_votes_are_the_weights_of_the_labels_in_shares(tmp_path: Path) -> N
     )
     assert not votes.shares[~seen].any()
     assert heard == [1, 2, 3]
-
-
-def test_views_without_labels_do_not_vote(tmp_path: Path) -> None:
-    g, scene = _scene()
-    images = _truth(g, scene)
-    images[1:] = [np.full_like(image, -1) for image in images[1:]]
-    masks = _write(tmp_path, scene, images)
-    np.testing.assert_array_equal(
-        gather(g, scene, masks, range(4)).shares, gather(g, scene, masks, [0]).shares
-    )
 
 
 def _drawn(*shares: float) -> Float32[np.ndarray, "C 1 1"]:

@@ -25,7 +25,7 @@ from sagesplat.raster import Workspace
 from sagesplat.scene.images import Photos
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.train import stepper, trainer
-from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views
+from sagesplat.train.early_stopping import ActiveTiles
 from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.trainer import train
@@ -150,14 +150,3 @@ def watched_states(monkeypatch: pytest.MonkeyPatch) -> None:
         return call(self, state, *args, **options)
 
     monkeypatch.setattr(Stepper, "__call__", watched)
-
-
-def test_quality_is_what_the_cpu_measures(scene, on_gpu, monkeypatch):  # noqa: F811
-    g = final(run(scene, SHORT))
-    work, rows = ActiveTiles(scene, Halves()), measured_views(scene, Halves())  # type: ignore[arg-type]
-    feed = stepper.PhotoLoader(scene, Photos(scene.views), CPU)
-    there = label_quality(g, work, feed, rows, SHORT, 3, backend="cuda")
-    monkeypatch.undo()
-    here = label_quality(g, work, feed, rows, SHORT, 3, backend="cpu")
-    assert there.keys() == here.keys() == {-1, 3, 184}
-    np.testing.assert_allclose(list(there.values()), list(here.values()), atol=2e-3)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.train.instances import label
-from sagesplat.train.view_consensus import Sightings, join
+from sagesplat.train.view_consensus import Sightings
 
 TAXONOMY = Taxonomy({62: "chair", 184: "tree-merged"})
 CHAIR = 1  # column of chairs: the first one is of what is unlabelled
@@ -60,7 +60,7 @@ def model(n: int, label_id: int = 62) -> Gaussians:
     return Gaussians(z(n, 3) + torch.arange(n)[:, None], z(n, 4), z(n, 3), z(n), z(n, 1, 3), z(n, 0, 3), ids)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 1000), count=st.integers(2, 6))
 def test_numbers_of_single_views_do_not_matter(seed: int, count: int) -> None:
     objects = np.repeat(np.arange(count), range(20, 20 + count))
@@ -81,11 +81,6 @@ def test_masks_that_are_cut_or_lost_in_some_views_do_no_harm(seed: int) -> None:
     objects = np.repeat(np.arange(5), 40)
     found = label(model(len(objects)), seen(objects, 16, 0.3, seed), TAXONOMY)
     assert adjusted_rand_index(objects, found.label_ids) > 0.95
-
-
-def test_results_are_the_same_every_time() -> None:
-    sightings = seen(np.repeat(np.arange(5), 40), 16, 0.3, 0)
-    assert (join(sightings) == join(sightings)).all()
 
 
 def test_an_instance_of_one_view_stays_in_its_category() -> None:
