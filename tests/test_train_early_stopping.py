@@ -14,13 +14,12 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.demo.capture import make_capture
-from sagesplat.raster import rasterize
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Masks, Taxonomy
-from sagesplat.train import schedule, stepper, trainer
+from sagesplat.train import schedule, trainer
 from sagesplat.train.early_stopping import (
     ActiveTiles,
     active_tiles,
@@ -186,30 +185,6 @@ def test_masks_of_tiles_fit_photos_of_any_size(height, width, factor, seed):
         for (row, column), active in np.ndenumerate(tiles):
             part = labels[16 * row : 16 * row + 16, 16 * column : 16 * column + 16]
             assert active == (part != 1).any()
-
-
-def test_stopped_categories_stop_costing(capture, monkeypatch):
-    """What is drawn shrinks with every category that stops, and frozen rows take no gradient."""
-    scene, photos, masks, labels = capture
-    drawn: list[tuple[int, float]] = []
-
-    def watched(*args, **options):
-        tiles = options["tile_mask"]
-        drawn.append((int(options["trainable"] is not None), 1.0 if tiles is None else float(tiles.mean())))
-        return rasterize(*args, **options)
-
-    monkeypatch.setattr(stepper, "rasterize", watched)
-    frozen_at: list[int] = []
-    config = replace(CONFIG, freeze_at=0.44)
-    for event in train(scene, photos, labels, config, masks=masks):
-        if isinstance(event, LabelFrozen):
-            frozen_at.append(event.step)
-    first, last = min(frozen_at), max(step for step in frozen_at if step < config.max_steps)
-    assert set(drawn[:first]) == {(0, 1.0)}
-    before = np.mean([share for _, share in drawn[first:last]])
-    after = np.mean([share for _, share in drawn[last:]])
-    assert after < before < 1
-    assert all(asked for asked, _ in drawn[first:])  # for no gradients of frozen rows
 
 
 def test_finished_views_are_drawn_in_one_round_of_eight(capture):

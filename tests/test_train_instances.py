@@ -105,15 +105,6 @@ def test_gaussians_that_no_view_sees_follow_their_neighbours() -> None:
     assert adjusted_rand_index(objects, found.label_ids) == 1
 
 
-def test_views_that_lost_the_mask_have_no_say() -> None:
-    objects = np.repeat(np.arange(2), 30)
-    sightings = seen(objects, 8, 0.0, 0)
-    sightings.columns[objects == 0, 2:] = CHAIR  # six of eight views have no mask of it
-    sightings.columns[5, 0] = CHAIR  # beside the mask in one of the two views that have it
-    found = label(model(len(objects)), sightings, TAXONOMY)
-    assert adjusted_rand_index(objects, found.label_ids) == 1
-
-
 def test_a_gaussian_at_a_border_counts_with_both_sides() -> None:
     objects = np.repeat(np.arange(2), 30)
     one = seen(objects, 6, 0.0, 0)

@@ -77,16 +77,11 @@ def test_axes_move_the_image_by_their_length(scene, monkeypatch):
     assert np.abs(np.array(effects) @ np.array(effects).T - np.eye(6)).max() < 0.03
 
 
-def test_a_view_of_few_points_has_axes(scene):
-    nothing = replace(
-        scene.points, xyz=scene.points.xyz - np.array([0, 0, 100], np.float32)
-    )  # behind the cameras
-    axes = motion_axes(replace(scene, points=nothing), 0)
+def test_views_of_few_points_or_without_tracks_have_axes(scene):
+    behind = replace(scene.points, xyz=scene.points.xyz - np.array([0, 0, 100], np.float32))
+    axes = motion_axes(replace(scene, points=behind), 0)
     assert np.abs(axes).max() < 4 * scene.scale
     assert np.linalg.matrix_rank(axes) == 6
-
-
-def test_a_view_without_tracks_has_the_axes_of_the_points_in_it(scene):
     none = {name: getattr(scene.points, name)[:0] for name in ("track_points", "track_views", "track_uv")}
     axes = motion_axes(replace(scene, points=replace(scene.points, **none)), 0)
     expected = motion_axes(scene, 0)
