@@ -229,21 +229,6 @@ def test_to_stay_is_always_considered(problem, share, slack):
     assert value_in_units(choices, plan.levels) >= value_in_units(choices, before) - len(cost)  # rounding
 
 
-@pytest.mark.parametrize("mode", [{"target": 0.8}, {"budget": 400_000.0}])
-def test_a_path_is_one_plan_after_another(mode):
-    quality, cost, weight = make_plans.scene(np.random.default_rng(1), 25, 6, 8)
-    weights = weight * np.random.default_rng(2).uniform(0, 2, (25, 6))
-    plan = along(quality, cost, weight=weights, **mode)
-    levels = None
-    for p in range(25):
-        if "target" in mode:
-            levels = cheapest(quality[p], cost, mode["target"], previous=levels).levels
-        else:
-            levels = best_within(quality[p], cost, weights[p], mode["budget"], previous=levels).levels
-        assert plan[p].tolist() == levels.tolist()
-    assert len(np.unique(plan, axis=0)) > 2
-
-
 GOOD = {"quality": [[0.5, 0.8], [0.4, 0.9]], "cost": [[1, 2], [3, 4]], "weight": [1, 1], "budget": 5}
 
 

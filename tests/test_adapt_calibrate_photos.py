@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 
 from sagesplat.adapt.calibrate_photos import (
-    MULTIPLIERS,
     TARGETS,
     LeftOut,
-    _decisions,
-    _envelope,
     _inflation,
-    _risks,
-    _Scored,
     _slope,
     calibrate_photos,
     with_changes,
@@ -32,25 +27,6 @@ def left_out(
     mean = STEPS + 0.05 * rng.standard_normal((n, 1))
     ssim = mean + (scale * rng.standard_normal(n))[:, None]
     return LeftOut.alone(np.arange(n), u, mean, ssim, np.full(n, 0.9))
-
-
-def test_decisions_and_risks_by_hand():
-    g = int(np.argmin(np.abs(TARGETS - 0.6)))
-    change, bias = np.zeros((2, len(TARGETS))), np.zeros(len(TARGETS))
-    change[1, g], bias[g] = 0.2, 0.03
-    score, measured = np.array([[0.5, 0.7], [0.4, 0.6]]), np.array([[0.65, 0.7], [0.3, 0.55]])
-    own = _Scored(score, measured, change, bias, 0.1, 0.0)
-    accepted, missed = _decisions(own, g)
-    for column, multiplier in enumerate(MULTIPLIERS):
-        threshold = 0.6 + multiplier * 0.1 - 0.03
-        for view in range(2):
-            level = next((k for k in range(2) if own.score[view, k] >= threshold), None)
-            got = np.nan if level is None else own.measured[view, level] + [0.0, 0.2][view]
-            assert accepted[view, column] == (level is not None)
-            assert missed[view, column] == (level is not None and got < 0.6)
-    risk = _risks(np.array([[4.0], [1.0], [0.0]]), np.array([[1.0], [1.0], [0.0]]), 1)
-    by_view, by_decision = (0.25 + 1 + 1) / (2 + 1), (2 + 2.5) / (5 + 2.5)
-    np.testing.assert_allclose(risk, [max(by_view, by_decision)])
 
 
 def test_each_multiplier_keeps_the_risk_and_a_smaller_one_does_not():
@@ -126,17 +102,6 @@ def test_the_discount_follows_errors_that_grow_away_from_known_views():
     one, other = calibrate_photos({1: far}, 0.95)[1], calibrate_photos({1: flat}, 0.95)[1]
     assert one.discount > 0.1 > other.discount
     assert one.least_support == pytest.approx(0.5)
-
-
-def test_a_higher_targets_threshold_keeps_a_lower_target_too():
-    none = np.zeros((1, len(TARGETS)))
-    own = _Scored(np.full((1, 1), 0.95), np.full((1, 1), 0.95), none, none[0], 0.1, 0.0)
-    multipliers = np.where(TARGETS < 0.5, 4.0, 0.5)
-    multipliers[-3:] = np.inf
-    targets, thresholds = _envelope(multipliers, own)
-    assert targets[-1] == TARGETS[-4]
-    assert (thresholds[:4] <= 0.5 + 0.05 + 1e-6).all()
-    assert (np.diff(thresholds) > 0).all()
 
 
 def test_changes_of_views_that_were_not_measured_are_those_of_the_nearest():

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sagesplat.adapt import free_space
-from sagesplat.adapt.free_space import cloud_of, space_of, sphere
+from sagesplat.adapt.free_space import sphere
 from sagesplat.adapt.free_viewpoints import FreeViewpoints, free_cameras
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
@@ -256,20 +256,6 @@ def test_nothing_in_sight():
 def test_impossible_arguments(wrong):
     with pytest.raises(RunError, match=r"choose|give"):
         free_cameras(BALL, **{"count": 2, **wrong})
-
-
-def test_rays_meet_what_is_there():
-    cloud = cloud_of(BALL)
-    space = space_of(cloud, 0)
-    centre = (np.array([2.0, 0, 5]) - cloud.centre) / cloud.unit
-    outside = centre + np.array([0, 0, -4.0]) / cloud.unit
-    distance, log_size = space.look(
-        np.stack([centre, outside]), np.array([[0, 0, 1.0], [0, 0, -1], [1, 0, 0]])
-    )
-    assert np.abs(distance[0] * cloud.unit - 1).max() < 0.15
-    assert distance[1, 0] * cloud.unit == pytest.approx(3, abs=0.2)
-    assert np.isinf(distance[1, 1:]).all()
-    assert np.exp(log_size[1, 0]) * cloud.unit == pytest.approx(2 / np.sqrt(300), rel=0.05)
 
 
 def test_quantiles_by_weight():

@@ -49,12 +49,6 @@ def test_a_level_shows_opacities_between_the_two(tmp_path):
     assert len(found.compose({})) == 0
 
 
-def test_a_ladder_without_second_opacities(tmp_path):
-    g, found = ladder(tmp_path, None)
-    assert found.second is None
-    assert torch.equal(found.load(3).logit_opacities, g.logit_opacities)
-
-
 @pytest.mark.parametrize(
     "second",
     [

@@ -18,8 +18,6 @@ from sagesplat.adapt.viewpoint import (
     STATUSES,
     Calibration,
     ViewModel,
-    constant_curve,
-    means_at,
     monotone,
     read_promises,
     write_promises,
@@ -105,12 +103,6 @@ def test_neither_mean_nor_bound_ever_falls_from_level_to_level(mean, support):
     assert (np.diff(bound, axis=1) >= 0).all()
     steady = np.sort(mean, 1)
     np.testing.assert_array_equal(monotone(steady), steady)
-
-
-def test_constant_curves_are_the_same_at_every_distance():
-    curves = [constant_curve(7, level, value, 0.01, 9) for level, value in ((1, 0.8), (2, 1.0))]
-    distance = np.array([0.1, 3.0, 1e4, np.nan])
-    np.testing.assert_allclose(means_at(curves, distance), np.tile([0.8, 1.0], (4, 1)))
 
 
 def test_round_trip(tmp_path, model):

@@ -25,7 +25,6 @@ from sagesplat.train.early_stopping import (
     active_tiles,
     label_quality,
     measured_views,
-    trainable_rows,
 )
 from sagesplat.train.events import LabelFrozen, Resumed, Step, Trained
 from sagesplat.train.lr_schedule import smaller
@@ -135,16 +134,6 @@ def test_a_target_needs_label_images(capture):
         next(train(scene, photos, labels, replace(CONFIG, freeze_at=0.5)))
 
 
-def test_rows_that_may_change(capture):
-    g = Gaussians(
-        *[torch.zeros(4, *shape) for shape in ((3,), (4,), (3,), (), (1, 3), (0, 3))],
-        label_ids=torch.tensor([-1, 3, 184, 3], dtype=torch.int16),
-    )
-    assert trainable_rows(g, {}).tolist() == [True] * 4
-    assert trainable_rows(g, {3: 100, 7: 5}).tolist() == [True, False, True, False]
-    assert trainable_rows(g, {-1: 1}).tolist() == [False, True, True, True]
-
-
 def test_tuning_improves_and_keeps_the_set(capture):
     scene, photos, _, labels = capture
     *_, end = train(scene, photos, labels, replace(CONFIG, max_steps=60))
@@ -156,21 +145,6 @@ def test_tuning_improves_and_keeps_the_set(capture):
         assert torch.equal(p, getattr(end.gaussians, name))
     was, now = (measured(g, capture, 3) for g in (before, tuned))
     assert np.mean(list(now.values())) > np.mean(list(was.values())) + 0.01
-
-
-def test_tiles_with_only_stopped_categories_are_done():
-    labels = np.zeros((40, 50), np.int16)
-    labels[:, 30:] = 3
-    labels[39, 49] = -1
-    left, both = [True, True, False, False], [True, True, False, True]
-    assert active_tiles(labels, {3}).tolist() == [left, left, both]
-    assert active_tiles(labels, {3, -1}).tolist() == [left] * 3
-    assert active_tiles(labels, {0, 3}).tolist() == [[False] * 4] * 2 + [[False, False, False, True]]
-    assert not active_tiles(labels, {-1, 0, 3}).any()
-    assert active_tiles(labels, ()).all()
-    # the image 20 x 25 has 2 x 2 tiles, the right ones from column 32 on
-    assert active_tiles(labels, {3}, 2).tolist() == [[True, False], [True, True]]
-    assert active_tiles(labels, {3}, 4).tolist() == [[True]]
 
 
 @settings(max_examples=50, derandomize=True)
