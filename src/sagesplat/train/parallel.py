@@ -82,6 +82,7 @@ def _lost(workers: Sequence[BaseProcess]) -> str | None:
     """Which process is gone, in words; the connection to it is lost before it has ended."""
     wait([worker.sentinel for worker in workers], timeout=_LOST_AFTER)
     for rank, worker in enumerate(workers, 1):
+        worker.join(5)
         if worker.exitcode:
             return f"process {rank} of {len(workers) + 1} ended with code {worker.exitcode}"
     return None
