@@ -2,7 +2,7 @@
 
 Projection, binning and harmonics are gsplat's own torch code, in float64. Pixels are blended here, as its
 kernels do: alphas cut at 0.999 and below 1/255, a pixel ends before its transmittance falls to 1e-4. What the
-kernels leave unwritten is NaN here, and `absgrad` is written onto the tensor that was saved, as theirs.
+kernels leave unwritten is NaN here.
 """
 
 import functools
@@ -103,9 +103,7 @@ def _blend(pixels, xy, conics, colors, opacities, background):
 
 class _RasterizeToPixels(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means2d, conics, colors, opacities, background, masks, size, tile_size, offsets, ids, absgrad
-    ):
+    def forward(ctx, means2d, conics, colors, opacities, background, masks, size, tile_size, offsets, ids):
         width, height = size
         image = torch.full((1, height, width, colors.shape[-1]), NAN)
         alphas = torch.full((1, height, width, 1), NAN)
@@ -119,15 +117,14 @@ class _RasterizeToPixels(torch.autograd.Function):
             for whole, part in ((image[0], painted), (alphas[0], alpha)):
                 whole[window[:2]] = part.reshape(whole[window[:2]].shape).float()
         ctx.save_for_backward(means2d, conics, colors, opacities, background, masks, offsets, ids)
-        ctx.kept = size, tile_size, absgrad
+        ctx.kept = size, tile_size
         return image, alphas
 
     @staticmethod
     def backward(ctx, g_image, g_alphas):  # type: ignore
         means2d, conics, colors, opacities, background, masks, offsets, ids = ctx.saved_tensors
-        size, tile_size, absgrad = ctx.kept
+        size, tile_size = ctx.kept
         grads = [torch.zeros_like(each[0]).double() for each in (means2d, conics, colors, opacities)]
-        absolute = torch.zeros_like(grads[0])
         for window, pixels, rows in _tiles(size, tile_size, offsets, ids):
             if len(rows) == 0 or (masks is not None and not masks[0][window[2]]):
                 continue
@@ -142,12 +139,9 @@ class _RasterizeToPixels(torch.autograd.Function):
                 g_alphas[0][window[:2]].reshape(alpha.shape),
             )
             xy, *others = torch.autograd.grad((painted, alpha), inputs, [w.double() for w in wanted])
-            absolute.index_add_(0, rows, xy.abs().sum(0))
             for grad, part in zip(grads, (xy.sum(0), *others), strict=True):
                 grad.index_add_(0, rows, part)
-        if absgrad:
-            means2d.absgrad = absolute.float()[None]
-        return (*(grad.float()[None] for grad in grads), *[None] * 7)
+        return (*(grad.float()[None] for grad in grads), *[None] * 6)
 
 
 def _tiles(size, tile_size: int, offsets: Tensor, ids: Tensor):
@@ -167,7 +161,7 @@ def _tiles(size, tile_size: int, offsets: Tensor, ids: Tensor):
 
 
 def rasterize_to_pixels(
-    means2d, conics, colors, opacities, width, height, tile_size, offsets, ids, *, backgrounds, masks, absgrad
+    means2d, conics, colors, opacities, width, height, tile_size, offsets, ids, *, backgrounds, masks
 ):
     assert colors.shape[-1] in (1, 3, 4, 5, 8, 9, 16, 17, 32), "a count that is compiled"
     assert masks is None or masks.shape == offsets.shape
@@ -175,7 +169,7 @@ def rasterize_to_pixels(
     assert means2d.shape[:-1] == conics.shape[:-1] == colors.shape[:-1] == opacities.shape
     inputs = [each.contiguous() for each in (means2d, conics, colors, opacities)]
     size = width, height
-    return _RasterizeToPixels.apply(*inputs, backgrounds, masks, size, tile_size, offsets, ids, absgrad)
+    return _RasterizeToPixels.apply(*inputs, backgrounds, masks, size, tile_size, offsets, ids)
 
 
 FUNCTIONS = (

@@ -14,7 +14,7 @@ from sagesplat.adapt.allocate import SLACK, along, best_within, cheapest
 from sagesplat.core.errors import RunError
 
 VECTORS = [case for case in json.loads(make_plans.PATH.read_text()) if case["mode"] != "fill"]
-quick = settings(max_examples=60, deadline=None)  # a busy machine is no failure
+quick = settings(max_examples=60)
 IDS = [f"{case['name']}, {case['mode']}" for case in VECTORS]
 
 
@@ -105,31 +105,6 @@ def test_vectors_are_those_of_the_implementation(case):
     assert json.loads(json.dumps(make_plans.expected(case))) == case["expected"]
 
 
-@pytest.mark.parametrize("case", VECTORS, ids=IDS)
-def test_vectors_are_right(case):
-    """What can be said without the implementation."""
-    quality, cost, rest = make_plans.arguments(case)
-    found = case["expected"]
-    if quality.ndim == 3 or len(cost) > 5 or case.get("states") == 0:
-        return
-    labels = usable(quality, cost)
-    if case["mode"] == "budget":
-        previous, slack = rest.get("previous"), rest.get("slack", SLACK)
-        choices = in_units(labels, rest["weight"], previous, slack)
-        assert found["levels"] == brute_force(choices, rest["budget"])
-        assert found["optimal"]
-    elif "previous" not in rest:
-        targets = np.broadcast_to(rest["target"], len(cost))
-        assert found["levels"] == [best_of(*pair) for pair in zip(labels, targets, quality, strict=True)]
-    chosen = [
-        next(level for level in levels if level[0] == k)
-        for k, levels in zip(found["levels"], labels, strict=True)
-    ]
-    weight = rest.get("weight", np.ones(len(cost)))
-    assert found["cost"] == sum(c for _, _, c in chosen)
-    assert math.isclose(found["value"], sum(w * q for w, (_, q, _) in zip(weight, chosen, strict=True)))
-
-
 def best_of(levels, target, quality):
     """Plain rule of a target for one label."""
     if all(math.isnan(quality[k]) for k, _, _ in levels):
@@ -152,7 +127,7 @@ def test_cheapest_is_the_plain_rule(problem, target):
     assert plan.status == ("infeasible" if plan.missed.any() else "ok")
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(problems(), st.floats(0, 1.1), st.booleans())
 def test_small_plans_are_exact(problem, share, again):
     quality, cost, weight = problem
@@ -185,16 +160,6 @@ def test_never_worse_than_greed_nor_over_the_budget(problem, share, states):
     best = best_within(quality, cost, weight, budget, states=500_000)
     assert best.optimal
     assert plan.value <= best.value + 1e-9 <= plan.bound + 1e-8 * max(1.0, weight.sum())
-
-
-@quick
-@given(problems(), st.lists(st.floats(0, 1.1), min_size=2, max_size=6))
-def test_more_budget_gives_no_less(problem, shares):
-    quality, cost, weight = problem
-    most = np.where(np.isfinite(cost), cost, 0).max(1).sum()
-    plans = [best_within(quality, cost, weight, max(1.0, share * most)) for share in sorted(shares)]
-    values = [plan.value for plan in plans if plan.status == "ok"]
-    assert (np.diff(values) >= -1e-10 * weight.sum()).all()
 
 
 def test_subset_sums_of_large_costs_are_exact():
@@ -264,39 +229,6 @@ def test_to_stay_is_always_considered(problem, share, slack):
     assert value_in_units(choices, plan.levels) >= value_in_units(choices, before) - len(cost)  # rounding
 
 
-def test_without_slack_a_threshold_flickers_and_with_it_does_not():
-    wave = 0.004 * np.sin(np.arange(50))[:, None, None]
-    quality, cost = np.array([[0.6, 0.7, 0.8]]) + wave, np.array([[1, 2, 3]])
-    assert len(set(along(quality, cost, target=0.7, slack=0.0)[:, 0])) == 2
-    changes = np.diff(along(quality, cost, target=0.7)[:, 0])
-    assert np.count_nonzero(changes) <= 1
-
-
-@pytest.mark.parametrize("mode", [{"target": 0.8}, {"budget": 400_000.0}])
-def test_a_path_is_one_plan_after_another(mode):
-    quality, cost, weight = make_plans.scene(np.random.default_rng(1), 25, 6, 8)
-    weights = weight * np.random.default_rng(2).uniform(0, 2, (25, 6))
-    plan = along(quality, cost, weight=weights, **mode)
-    levels = None
-    for p in range(25):
-        if "target" in mode:
-            levels = cheapest(quality[p], cost, mode["target"], previous=levels).levels
-        else:
-            levels = best_within(quality[p], cost, weights[p], mode["budget"], previous=levels).levels
-        assert plan[p].tolist() == levels.tolist()
-    assert len(np.unique(plan, axis=0)) > 2
-
-
-def test_kinds_of_arrays_do_not_matter():
-    quality, cost, weight = make_plans.scene(np.random.default_rng(3), 1, 7, 5)
-    plan = best_within(quality[0], cost, weight, 200_000)
-    frozen = np.asfortranarray(quality[0])
-    frozen.setflags(write=False)
-    again = best_within(frozen, cost.astype(np.int64), weight[::-1].copy()[::-1], 200_000.7)
-    assert plan.levels.tolist() == again.levels.tolist()
-    assert best_within(quality[0], cost, weight, math.inf).levels.tolist() == quality[0].argmax(1).tolist()
-
-
 GOOD = {"quality": [[0.5, 0.8], [0.4, 0.9]], "cost": [[1, 2], [3, 4]], "weight": [1, 1], "budget": 5}
 
 
@@ -304,20 +236,13 @@ GOOD = {"quality": [[0.5, 0.8], [0.4, 0.9]], "cost": [[1, 2], [3, 4]], "weight":
     ("change", "message"),
     [
         ({"quality": [[0.5, 0.8]]}, r"do not fit; give \[labels, levels\] and \[labels, levels\]"),
-        ({"quality": [], "cost": []}, "do not fit"),
         ({"quality": [[0.5, 1.8], [0.4, 0.9]]}, "outside -1 to 1; give SSIM"),
-        ({"cost": [[1, 2.5], [3, 4]]}, "whole number"),
-        ({"cost": [[1, -2], [3, 4]]}, "whole number"),
         ({"cost": [[1, math.nan], [3, 4]]}, "whole number"),
         ({"cost": [[1, 2], [3, 2**53]]}, "larger unit"),
         ({"cost": [[1, 2], [math.inf, math.inf]]}, "label 1 has no level"),
         ({"weight": [1, -1]}, "weight is negative or not finite"),
-        ({"weight": [1, math.nan]}, "weight is negative or not finite"),
-        ({"weight": [1]}, "give one weight per label"),
-        ({"budget": 0}, "budget 0 is impossible; choose one above 0"),
-        ({"budget": math.nan}, "budget nan is impossible"),
+        ({"budget": math.nan}, "budget nan is impossible; choose one above 0"),
         ({"previous": [0, 2]}, "previous levels do not fit; give whole numbers, -1 to 1, for 2 labels"),
-        ({"previous": [0.0, 1.0]}, "previous levels do not fit"),
         ({"slack": math.nan}, "slack nan is impossible"),
     ],
 )

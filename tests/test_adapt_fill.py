@@ -9,19 +9,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sagesplat.adapt.allocate import cheapest
 from sagesplat.adapt.fill import SLACK, fill
 from sagesplat.core.errors import RunError
 
 VECTORS = [case for case in json.loads(make_plans.PATH.read_text()) if case["mode"] == "fill"]
-quick = settings(max_examples=150, deadline=None)
-
-
-def uniform_curve(nbytes, quality, cost, weight):
-    """Mean quality that all labels at one level have at some bytes, linear between the levels."""
-    known = np.isfinite(quality).all(1) & (weight > 0)
-    total = max(weight[known].sum(), 1e-300)
-    return np.interp(nbytes, cost.sum(0), weight[known] @ quality[known] / total)
+quick = settings(max_examples=150)
 
 
 @st.composite
@@ -142,30 +134,6 @@ def test_the_lowest_label_is_no_lower_than_with_equal_levels(problem, tolerance)
         assert mean_of(found, quality, weight) >= uniform - SLACK - 1e-8
 
 
-def test_a_scene_that_is_hard_in_a_small_category():
-    """What was wrong: bytes of a plan for a target went to what is hard, the whole image was worse."""
-    quality, cost, weight = (
-        x[0] if x.ndim == 3 else x for x in make_plans.scene(np.random.default_rng(3), 1, 12, 16)
-    )
-    quality = np.maximum.accumulate(quality, 1)
-    levels = cheapest(quality, cost, 0.6).levels
-    rows, curve = np.arange(len(levels)), lambda at: uniform_curve(at, quality, cost, weight)
-    assert mean_of(levels, quality, weight) < curve(cost[rows, levels].sum()) - 0.01
-    found = fill(levels, quality, cost, weight)
-    assert mean_of(found, quality, weight) >= curve(cost[rows, found].sum()) - SLACK - 1e-9
-    assert (quality[rows, found] >= 0.6).all() or (quality[:, -1] < 0.6).any()
-
-
-def test_a_hard_category_of_few_pixels_does_not_draw_the_scene_along():
-    """All of a small sky has to be sent: less than 0.004 of the whole image, so nothing else follows."""
-    ground = 1 - 0.4 * 0.7 ** np.arange(10.0)
-    quality = np.stack([ground, np.append(np.linspace(0.2, 0.5, 9), 1.0)])
-    cost = np.outer([100.0, 5.0], 1.4 ** np.arange(10.0))
-    weight, levels = np.array([98.0, 2.0]), np.array([4, 9])
-    assert mean_of(levels, quality, weight) < uniform_curve(cost[[0, 1], levels].sum(), quality, cost, weight)
-    assert fill(levels, quality, cost, weight).tolist() == [4, 9]
-
-
 @pytest.mark.parametrize("case", VECTORS, ids=[case["name"] for case in VECTORS])
 def test_vectors(case):
     assert make_plans.expected(case) == case["expected"]
@@ -179,12 +147,8 @@ def test_vectors(case):
     ("levels", "quality", "cost", "weight"),
     [
         ([0], [[0.5, 0.6]], [[1, 2, 3]], [1]),
-        ([0, 1], [[0.5, 0.6]], [[1, 2]], [1]),
-        ([2], [[0.5, 0.6]], [[1, 2]], [1]),
         ([-1], [[0.5, 0.6]], [[1, 2]], [1]),
         ([0], [[0.5, 0.6]], [[1, math.inf]], [1]),
-        ([0], [[0.5, 0.6]], [[-1, 2]], [1]),
-        ([0], [[0.5, 0.6]], [[1, 2]], [-1]),
         ([0], [[0.5, 0.6]], [[1, 2]], [math.nan]),
     ],
 )

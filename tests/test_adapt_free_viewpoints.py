@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import Phase, given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sagesplat.adapt import free_space
-from sagesplat.adapt.free_space import cloud_of, space_of, sphere
+from sagesplat.adapt.free_space import sphere
 from sagesplat.adapt.free_viewpoints import FreeViewpoints, free_cameras
-from sagesplat.adapt.upright import AXES
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.geometry import project, weighted_quantile
@@ -170,21 +167,6 @@ def test_the_unit_of_the_file_does_not_matter(g, scale):
     assert there.radius / scale == pytest.approx(here.radius, rel=1e-2)
 
 
-@settings(max_examples=5, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
-@given(st.floats(-6, 6), st.floats(0, 1), st.integers(0, 5), st.booleans())
-def test_whatever_the_size_place_and_orientation(log_scale, share, axis, inside):
-    scale, g = 10**log_scale, ROOM if inside else BALL
-    up = np.array(list(AXES.values())[axis])
-    turn = Rotation.align_vectors([up], [[0, -1, 0]])[0]
-    found = free_cameras(moved(g, scale=scale, turn=turn, shift=100 * scale * share), 3, up=up)
-    assert found.kind == ("place" if inside else "object")
-    assert len(found.cameras) == 3
-    for camera in found.cameras:
-        assert np.isfinite(camera.w2c).all()
-        np.testing.assert_allclose(camera.w2c[:3, :3] @ camera.w2c[:3, :3].T, np.eye(3), atol=1e-5)
-        assert camera.w2c[1, :3] @ found.up < 0
-
-
 @pytest.mark.parametrize("turned", [[90, 0, 0], [-90, 0, 0], [17, 0, 9], [0, 0, 90]])
 def test_the_floor_says_which_way_is_up(turned):
     turn = Rotation.from_euler("xyz", turned, degrees=True)
@@ -227,42 +209,33 @@ def test_floaters_and_a_far_sky_change_little():
     assert np.linalg.norm(found.centre - plain.centre) < 0.3
 
 
-def test_the_kind_may_be_asked_for():
-    found = free_cameras(ROOM, 4, kind="object")
-    assert found.kind == "object"
-    assert found.reason.startswith("object: as asked")
-
-
 def test_field_of_view_is_that_of_the_longer_side():
     wide, tall = (free_cameras(BALL, 1, fov=90, size=size).cameras[0] for size in ((300, 200), (200, 300)))
     assert wide.K[0, 0] == tall.K[0, 0] == pytest.approx(150)
     assert (wide.width, wide.height, tall.K[0, 2]) == (300, 200, 100)
 
 
-def one(**changes) -> Gaussians:
-    return replace(BALL.select(torch.tensor([0])), **changes)
-
-
-def test_one_gaussian_and_all_in_one_place():
-    assert len(free_cameras(one(), 5).cameras) == 5
-    many = BALL.select(torch.zeros(50, dtype=torch.int64))
-    assert len(free_cameras(many, 5).cameras) == 5
-
-
-def test_a_plane_is_an_object():
+def degenerate() -> dict[str, Gaussians]:
     rng = np.random.default_rng(0)
-    means = np.stack([rng.uniform(-1, 1, 400), np.zeros(400), rng.uniform(-1, 1, 400)], 1)
-    found = free_cameras(discs(means, np.tile([0, 1.0, 0], (400, 1)), 0.1), 8)
-    assert found.kind == "object"
-    assert len(found.cameras) == 8
-    assert positions(found)[:, 1].max() < 0  # over it
-
-
-def test_extreme_scales_do_not_overflow():
+    plane = np.stack([rng.uniform(-1, 1, 400), np.zeros(400), rng.uniform(-1, 1, 400)], 1)
     wild = BALL.log_scales.clone()
     wild[::7], wild[1::7] = 80.0, -90.0
-    for camera in free_cameras(replace(BALL, log_scales=wild), 3).cameras:
-        assert np.isfinite(camera.w2c).all()
+    return {
+        "one": BALL.select(torch.tensor([0])),
+        "all in one place": BALL.select(torch.zeros(50, dtype=torch.int64)),
+        "a plane": discs(plane, np.tile([0, 1.0, 0], (400, 1)), 0.1),
+        "extreme scales": replace(BALL, log_scales=wild),
+    }
+
+
+@pytest.mark.parametrize("name", degenerate())
+def test_degenerate_splats_are_looked_at(name):
+    found = free_cameras(degenerate()[name], 5)
+    assert len(found.cameras) == 5
+    assert all(np.isfinite(camera.w2c).all() for camera in found.cameras)
+    if name == "a plane":
+        assert found.kind == "object"
+        assert positions(found)[:, 1].max() < 0  # over it
 
 
 def test_nothing_in_sight():
@@ -283,20 +256,6 @@ def test_nothing_in_sight():
 def test_impossible_arguments(wrong):
     with pytest.raises(RunError, match=r"choose|give"):
         free_cameras(BALL, **{"count": 2, **wrong})
-
-
-def test_rays_meet_what_is_there():
-    cloud = cloud_of(BALL)
-    space = space_of(cloud, 0)
-    centre = (np.array([2.0, 0, 5]) - cloud.centre) / cloud.unit
-    outside = centre + np.array([0, 0, -4.0]) / cloud.unit
-    distance, log_size = space.look(
-        np.stack([centre, outside]), np.array([[0, 0, 1.0], [0, 0, -1], [1, 0, 0]])
-    )
-    assert np.abs(distance[0] * cloud.unit - 1).max() < 0.15
-    assert distance[1, 0] * cloud.unit == pytest.approx(3, abs=0.2)
-    assert np.isinf(distance[1, 1:]).all()
-    assert np.exp(log_size[1, 0]) * cloud.unit == pytest.approx(2 / np.sqrt(300), rel=0.05)
 
 
 def test_quantiles_by_weight():

@@ -49,19 +49,10 @@ def test_a_level_shows_opacities_between_the_two(tmp_path):
     assert len(found.compose({})) == 0
 
 
-def test_a_ladder_without_second_opacities(tmp_path):
-    g, found = ladder(tmp_path, None)
-    assert found.second is None
-    assert torch.equal(found.load(3).logit_opacities, g.logit_opacities)
-
-
 @pytest.mark.parametrize(
     "second",
     [
-        SecondOpacities(SECOND.logits[:-1], SECOND.weights),
         SecondOpacities(SECOND.logits.clone().fill_(torch.nan), SECOND.weights),
-        SecondOpacities(SECOND.logits, {0: (0, 0, 1)}),
-        SecondOpacities(SECOND.logits, WEIGHTS | {7: (0, 1)}),
         SecondOpacities(SECOND.logits, WEIGHTS | {7: (0, 1, 1.5)}),
     ],
 )  # fmt: skip

@@ -10,7 +10,6 @@ from sagesplat.adapt.observe import (
     TOTAL,
     as_unit,
     distances_in_views,
-    erode,
     measure,
     widest_lens,
     within_lens,
@@ -56,15 +55,6 @@ def test_a_picture_wider_than_the_photos_is_cut_to_them():
     assert cut.K[:2, 2].tolist() == [20, 20]
     assert (cut.w2c == phone.w2c).all()
     assert widest_lens([cut]) == pytest.approx((0.4, 1 / 3))
-
-
-def test_erode_keeps_pixels_that_are_far_from_any_border():
-    label_ids = np.full((40, 50), 3, np.int16)
-    label_ids[:, 25:] = 4
-    inner = erode(label_ids)
-    assert set(np.unique(inner[:, :20])) == {3}
-    assert set(np.unique(inner[:, 30:])) == {4}
-    assert not np.isin(inner[:, 20:30], (3, 4)).any()
 
 
 def test_measure_takes_means_of_the_map_over_each_mask():

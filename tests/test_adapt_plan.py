@@ -11,14 +11,11 @@ from hypothesis import strategies as st
 from benchmarks.audit import (
     BENCH,
     GRASS,
-    NAMES,
     PAVEMENT,
     STEPS,
     TABLE_III,
     TREE,
-    choices_table,
     paper_plan,
-    sums_table,
 )
 from sagesplat.adapt.eq1 import plan_scene, plan_view
 from sagesplat.adapt.eq3 import Eq3, SsimModel
@@ -64,14 +61,6 @@ def test_table_iii_totals():
     assert paper_plan(0.6).count < 5138872  # and every category that can reach 0.6 does, unlike the paper's
 
 
-def test_the_audit_says_what_differs():
-    rows = {row[0]: row for row in choices_table().rows}
-    differ = {name for name in NAMES for t in range(3) if rows[name][1 + 3 * t] != rows[name][2 + 3 * t]}
-    assert differ == {"bench", "grass-merged", "tree-merged", "pavement-merged"}
-    assert [row[3] for row in sums_table().rows] == [-18_231, 0, -500, 0]
-    assert all("grass-merged: 224.5 printed, 244.5" in str(row[4]) for row in sums_table().rows)
-
-
 def test_levels_after_a_reset_are_taken_only_where_there_is_no_other():
     """The paper's 10 000 column is such a level (sky falls from 0.805 to 0.794 in it)."""
     plan = paper_plan(0.6, recovering={10000})
@@ -91,19 +80,6 @@ def test_distance_decides():
         plan = plan_view(models, counts, unknown, 0.8, 3)
         assert plan.levels == {1: 1000}
         assert math.isnan(plan.choices[0].distance)
-
-
-def test_a_scene_needs_its_share_of_views():
-    models = {(1, 1000): fading(1, 1000, 0.9, 0.1), (1, 2000): fading(1, 2000, 0.9, 0.01)}
-    counts = {(1, 1000): 10, (1, 2000): 20}
-    distances = {1: np.array([0.0] * 19 + [9.0])}  # one view in twenty is far
-    assert plan_scene(models, counts, distances, 0.8, 0.95).levels == {1: 1000}
-    strict = plan_scene(models, counts, distances, 0.8, 1.0)
-    assert (strict.levels, strict.status, strict.share) == ({1: 2000}, "ok", 1.0)
-    assert strict.choices[0].predicted == pytest.approx(0.9 * math.exp(-0.09))
-    # Nobody reaches 0.85 at 9: the level that serves most views, here 19 of 20 both, then the better mean.
-    hopeless = plan_scene(models, counts, distances, 0.85, 1.0)
-    assert (hopeless.levels, hopeless.status) == ({1: 2000}, "infeasible")
 
 
 def test_a_category_that_was_never_seen_is_shipped_whole():
@@ -146,7 +122,7 @@ ladders = st.dictionaries(
     st.tuples(ssims, st.sampled_from([0.0, 0.05, 0.3]), st.integers(0, 3)),
     min_size=1,
 )
-quick = settings(max_examples=60, deadline=None)  # a busy machine is no failure
+quick = settings(max_examples=60)
 targets = st.sampled_from([0.2, 0.3, 0.45, 0.5, 0.6, 0.8, 0.95, 1.0])
 
 
@@ -181,16 +157,6 @@ def test_a_view_plan_is_the_cheapest_that_will_do(ladder, target, distance):
 
 
 @quick
-@given(ladders, st.tuples(targets, targets), st.floats(0, 12))
-def test_a_higher_target_never_costs_less(ladder, two_targets, distance):
-    models, counts = split(ladder)
-    low, high = (plan_view(models, counts, everywhere(distance), target, 0) for target in sorted(two_targets))
-    for cheap, dear in zip(low.choices, high.choices, strict=True):
-        assert cheap.count <= dear.count
-        assert cheap.status == "ok" or dear.status == "infeasible"
-
-
-@quick
 @given(
     ladders, targets, st.lists(st.floats(0, 12), min_size=1, max_size=7), st.sampled_from([0.3, 0.5, 0.95, 1])
 )
@@ -212,32 +178,6 @@ def test_a_scene_plan_is_the_cheapest_that_will_do(ladder, target, distances, sh
         assert (models[mine](views) >= choice.predicted).mean() >= share
 
 
-@quick
-@given(ladders, targets, st.floats(0, 12))
-def test_one_view_is_a_scene_of_one(ladder, target, distance):
-    models, counts = split(ladder)
-    view = plan_view(models, counts, everywhere(distance), target, None)
-    scene = plan_scene(models, counts, {label: np.array([distance]) for label in LABELS}, target, 1.0)
-    assert view.levels == scene.levels
-    assert [c.status for c in view.choices] == [c.status for c in scene.choices]
-
-
-def test_plans_read_back_identical(tmp_path):
-    path = tmp_path / "plan.json"
-    models = {(label, step): fading(label, step, 0.9, 0.1) for label in (2, 5) for step in (10, 20)}
-    counts = {key: 7 * key[1] for key in models}
-    counts |= {(-1, 20): 12}  # a category without a model: NaN in the plan, null in the file
-    views = [plan_view(models, counts, {2: 1.5, 5: 2.5}, target, 4) for target in (0.5, 0.7)]
-    scene = [plan_scene(models, counts, {}, 0.6)]
-    write_plans(path, scene, views)
-    document = json.loads(path.read_text(), parse_constant=pytest.fail)
-    assert document["targets"] == [0.5, 0.6, 0.7]
-    assert document["views"][0]["nbytes"] == views[0].nbytes
-    scene_back, views_back = read_plans(path)
-    assert repr(scene_back) == repr(tuple(scene))  # repr, since NaN differs from itself
-    assert repr(views_back) == repr(tuple(views))
-
-
 def test_all_of_a_plan_for_fidelity_reads_back(tmp_path):
     path = tmp_path / "plan.json"
     choices = (
@@ -245,27 +185,24 @@ def test_all_of_a_plan_for_fidelity_reads_back(tmp_path):
         Choice(5, 9, math.nan, math.nan, 7, "no promise", 100, False, None),
     )
     plans = (Plan(0.95, None, choices, 0.95, quality="fidelity"), Plan(0.7, None, choices, 0.95))
-    write_plans(path, plans)
+    models = {(2, 10): fading(2, 10, 0.9, 0.1)}
+    views = (plan_view(models, {(2, 10): 70, (-1, 20): 12}, {2: 1.5}, 0.5, 4),)
+    write_plans(path, plans, views)
     document = json.loads(path.read_text(), parse_constant=pytest.fail)
     assert [entry["quality"] for entry in document["scene"]] == ["fidelity", "ssim"]
     assert document["scene"][0]["status"] == "no promise"
     assert document["scene"][0]["choices"][0]["reached"] == {
         "share": 0.97, "low": 0.94, "high": 0.99, "num_views": 240,
     }  # fmt: skip
-    assert repr(read_plans(path)[0]) == repr(plans)
+    assert document["targets"] == [0.5, 0.7, 0.95]
+    assert repr(read_plans(path)) == repr((plans, views))  # repr, since NaN differs from itself
     assert (plans[0].verdict, plans[0].calibrated) == ("no promise, uncalibrated", False)
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        "[]",
-        '{"scene": []}',
-        '{"scene": [{"target": 0.5}], "views": []}',
         '{"scene": [], "views": [{"target": 0.5, "view": 1e999, "share": null, "choices": []}]}',
-        '{"scene": [], "views": [{"target": 0.5, "view": 1, "share": null, "choices": [{"label_id": 1,'
-        ' "level": 1, "predicted": 0.5, "distance": null, "count": 1, "status": "fine"}]}]}',
-        '{"views": [], "scene": [{"target": 1, "view": 1, "share": null, "choices": [], "quality": "psnr"}]}',
         '{"views": [], "scene": [{"target": 0.5, "view": 1, "share": null, "choices": [{"label_id": 1,'
         ' "level": 1, "predicted": 0.5, "distance": null, "count": 1, "status": "ok",'
         ' "reached": {"share": 0.5, "low": 0.6, "high": 1, "num_views": 3}}]}]}',

@@ -36,18 +36,6 @@ def test_leaving_one_out_in_closed_form_is_what_a_fit_without_the_view_says():
         rest = np.arange(20) != i
         k = np.linalg.solve(S[np.ix_(rest, rest)], S[rest, i])
         np.testing.assert_allclose(process.left_out[i], k @ values[rest], atol=1e-9)
-        spread = process.amplitudes * np.sqrt(S[i, i] - k @ S[rest, i])
-        np.testing.assert_allclose(process.left_out_spread[i], spread, rtol=1e-6)
-
-
-def test_kernel_written_out():
-    x, _, _ = drawn(5)
-    lengths = (0.8, 1.2, 2.0)
-    for i in range(5):
-        for j in range(5):
-            r2 = sum(((x[i, g] - x[j, g]) ** 2).sum() / ll**2 for g, ll in zip(GROUPS, lengths, strict=True))
-            a = np.sqrt(3 * r2)
-            assert matern32(x, x, lengths)[i, j] == pytest.approx((1 + a) * np.exp(-a), abs=1e-12)
 
 
 def test_slopes_of_the_covariance():

@@ -11,7 +11,7 @@ from sagesplat.adapt.bound_plans import Costs, pooled
 from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels, reached
 from sagesplat.core.errors import RunError
 
-quick = settings(max_examples=80, deadline=None)
+quick = settings(max_examples=80)
 
 
 def costs(labels: int, levels: int) -> Costs:
@@ -140,12 +140,8 @@ def test_photos_of_training_count_less():
     assert (choice.predicted, choice.calibrated) == (pytest.approx(0.8), False)
     assert choice.reached is not None
     assert choice.reached.num_views == 75
-    (choice,) = plan_for_scene(measured[:70], pixels[:70], of, 0.75, 0.95, "ssim", trained[:70]).choices
-    assert (choice.predicted, choice.calibrated) == (pytest.approx(0.9), False)
     (choice,) = plan_for_scene(measured, pixels, of, 0.85, 0.95, "ssim", trained).choices
     assert (choice.status, choice.level) == ("infeasible", 1)
-    assert choice.reached is not None
-    assert (choice.reached.share, choice.reached.low) == (0, 0)
 
 
 def test_out_of_reach_takes_the_level_that_serves_most_views():

@@ -118,30 +118,17 @@ def test_files_come_back(tmp_path):
     "change",
     [
         {"format": "other"},
-        {"rule": {"seed": "x"}},
-        {"viewpoints": [{}]},
         {"viewpoints": [{"set": "fit", "w2c": [[1, 2], [3, 4]], "K": [[1]], "width": 4, "height": 4}]},
-        {"viewpoints": 4},
+        {"width": 10**6, "height": 10**6},
+        {"K": np.zeros((3, 3)).tolist()},
     ],
 )
 def test_damaged_files_are_one_line(tmp_path, change):
-    drawn = draw(SCENE, capture_cameras(SCENE), Rule(), {"fit": 1})
-    write_viewpoints(tmp_path / "v.json", drawn)
-    document = json.loads((tmp_path / "v.json").read_text()) | change
-    (tmp_path / "v.json").write_text(json.dumps(document))
-    with pytest.raises(DataError, match="run `sagesplat sample` again"):
-        read_viewpoints(tmp_path / "v.json")
-
-
-@pytest.mark.parametrize(
-    "entry", [{"width": 10**6, "height": 10**6}, {"set": "other"}, {"K": np.zeros((3, 3)).tolist()}]
-)
-def test_impossible_cameras_are_refused(tmp_path, entry):
     write_viewpoints(tmp_path / "v.json", draw(SCENE, capture_cameras(SCENE), Rule(), {"fit": 1}))
     document = json.loads((tmp_path / "v.json").read_text())
-    document["viewpoints"][0] |= entry
+    (document if change.keys() <= document.keys() else document["viewpoints"][0]).update(change)
     (tmp_path / "v.json").write_text(json.dumps(document))
-    with pytest.raises(DataError, match="not a file of viewpoints"):
+    with pytest.raises(DataError, match=r"not a file of viewpoints .*run `sagesplat sample` again"):
         read_viewpoints(tmp_path / "v.json")
 
 
@@ -154,7 +141,7 @@ def test_own_cameras_from_the_frames_of_a_transforms_file(tmp_path):
     assert (camera.width, camera.height) == (30, 20)
 
 
-@pytest.mark.parametrize("text", ["[]", "{", '{"frames": []}', '{"frames": [{}]}', '{"frames": 3}', "4"])
+@pytest.mark.parametrize("text", ["{", '{"frames": []}', '{"frames": [{}]}'])
 def test_lists_of_cameras_that_are_none(tmp_path, text):
     (tmp_path / "path.json").write_text(text)
     with pytest.raises((DataError, RunError), match=r"give a viewpoints\.json, or a transforms\.json"):

@@ -38,7 +38,7 @@ def code(coder: Writer | Reader, block: Block, *, reading: bool) -> list[np.ndar
     return found
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(blocks, min_size=1, max_size=4))
 def test_what_was_coded_is_read(coded: list[Block]):
     writer = Writer(Tables(COUNTS))
@@ -50,7 +50,7 @@ def test_what_was_coded_is_read(coded: list[Block]):
         np.testing.assert_array_equal(value, expected)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(blocks, min_size=1, max_size=2), st.data())
 def test_damage_ends_as_a_value_error(coded: list[Block], data: st.DataObject):
     writer = Writer(Tables(COUNTS))

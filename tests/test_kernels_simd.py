@@ -22,7 +22,6 @@ from sagesplat.kernels.simd import (
     log2,
     maximum,
     minimum,
-    prefetch,
     scatter,
     single,
     splat16,
@@ -140,13 +139,3 @@ def test_eight_sums_at_once(sums, lanes):
     sums(x, out)
     np.testing.assert_allclose(out[1:9], x.reshape(8, lanes).sum(1), rtol=1e-5, atol=1e-5)
     assert out[0] == out[9] == 0
-
-
-@njit
-def _prefetched(x):
-    prefetch(x, len(x) // 2)
-    return x.sum()
-
-
-def test_prefetching_changes_nothing():
-    assert _prefetched(np.ones(100, np.float32)) == 100

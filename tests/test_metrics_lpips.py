@@ -102,16 +102,6 @@ def test_images_too_small_are_nan(folder, net, smallest):
         assert np.isnan(lpips(*images(*size)))
 
 
-def test_images_as_they_come(folder):
-    """Read-only, mirrored, in float64: all the same."""
-    lpips = load_lpips("alex", folder)
-    x, y = images(40, 50)
-    expected = lpips(x, y)
-    mirrored = x[:, ::-1].copy()[:, ::-1]
-    mirrored.flags.writeable = False
-    assert lpips(mirrored, y.astype(float)) == expected
-
-
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_images_that_do_not_fit(folder):
     lpips = load_lpips("alex", folder)
@@ -136,45 +126,30 @@ def test_weights_come_from_the_cache(folder, tmp_path, monkeypatch):
     assert load_lpips("alex").net == "alex"
 
 
-def damage(weights, what):
-    if what == "missing":
-        del weights["conv3.bias"]
-    elif what == "shape":
-        weights["conv1.weight"] = weights["conv1.weight"][:-1]
-    elif what == "text":
-        weights["lin4"] = np.full(256, "a")
-    elif what == "object":
-        weights["lin4"] = np.array([None] * 256, object)
-    else:
-        weights["lin2"][7] = np.nan
-
-
-@pytest.mark.parametrize("what", ["missing", "shape", "text", "object", "nan"])
-def test_wrong_weights_are_one_line(tmp_path, what):
-    weights = random_weights("alex")
-    damage(weights, what)
-    np.savez(tmp_path / "lpips_alex.npz", allow_pickle=what == "object", **weights)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("conv1.bias", np.zeros(5, np.float16)),
+        ("lin4", np.array([None] * 256, object)),
+        ("lin2", np.full(384, np.nan, np.float32)),
+    ],
+)
+def test_wrong_weights_are_one_line(tmp_path, name, value):
+    weights = random_weights("alex") | {name: value}
+    np.savez(tmp_path / "lpips_alex.npz", allow_pickle=value.dtype == object, **weights)
     assert_refused("alex", tmp_path)
 
 
 def test_damaged_files_are_one_line(folder, tmp_path):
     path = tmp_path / "lpips_alex.npz"
     content = (folder / path.name).read_bytes()
-    flipped = bytearray(content)
-    flipped[len(content) // 2] ^= 1
     header = content.replace(b"'fortran_order': False", b"'fortran_order': (((((")  # numpy's parser gives up
-    for bad in b"", b"text", content[: len(content) // 2], content[1000:], flipped, header:
+    for bad in b"", content[: len(content) // 2], header:
         path.write_bytes(bad)
         assert_refused("alex", path)
-    with path.open("wb") as file:
-        np.save(file, np.zeros(3))
-    assert_refused("alex", path)
     path.unlink()
     path.mkdir()
     assert_refused("alex", path)
-
-
-def test_weights_of_the_other_net_are_refused(folder):
     assert_refused("vgg", folder / "lpips_alex.npz")
 
 

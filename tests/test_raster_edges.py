@@ -77,7 +77,7 @@ def test_not_finite_is_refused_in_one_line(name, value):
         rasterize(replace(g, **{name: parameter}), pinhole())
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60, derandomize=True)
 @given(
     count=st.integers(0, 12),
     degree=st.integers(0, 3),
@@ -95,7 +95,7 @@ def test_anything_finite_gives_something_finite(count, degree, seed, spread, sha
     assert_sound(wild, pinhole(*size), antialiased=antialiased)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10**6), st.floats(-3, 3), st.floats(-5, 1))
 def test_needles_in_any_direction_agree_with_the_reference(seed, length, width):
     torch.manual_seed(seed)

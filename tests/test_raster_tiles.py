@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagesplat.kernels.workspace import Workspace
-from sagesplat.raster import rasterize, tiles
+from sagesplat.raster import tiles
 from sagesplat.raster.cpu import _Options, _project
 
 BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50, derandomize=True)
 @given(st.lists(st.tuples(st.floats(0, 1e30), st.integers(0, 2)), max_size=60))
 def test_depth_order_is_a_stable_sort(rows):
     depths = np.array([d for d, _ in rows], np.float32).round(1) + np.float32(0.01)  # many ties
@@ -24,14 +24,6 @@ def test_depth_order_is_a_stable_sort(rows):
     drawn = np.flatnonzero(radii > 0)
     expected = drawn[np.argsort(depths[drawn], kind="stable")]
     np.testing.assert_array_equal(tiles.depth_order(depths, radii), expected)
-
-
-def test_depth_order_of_many():
-    rng = np.random.default_rng(0)
-    depths = np.exp(rng.normal(0, 3, 5000)).astype(np.float32)
-    depths[rng.integers(0, 5000, 500)] = depths[0]
-    order = tiles.depth_order(depths, np.ones(5000, np.float32))
-    np.testing.assert_array_equal(order, np.argsort(depths, kind="stable"))
 
 
 def test_intersections_are_exact_sorted_and_consistent():
@@ -84,21 +76,3 @@ def test_masked_tiles_show_the_background_and_take_no_gradient(keep):
         assert (grad - wanted[name]).abs().max() <= 1e-6 * wanted[name].abs().max(), name
     if keep == "none":
         assert all((grad == 0).all() for grad in grads.values())
-
-
-def test_gradients_stay_inside_the_kept_tiles():
-    g, camera = random_gaussians(100, seed=10, degree=0, log_scale=-4.0), pinhole(64, 48)
-    mask = np.zeros((3, 4), bool)
-    mask[1, 1] = True
-    render, grads = render_with_gradients(g, camera, tile_mask=mask)
-    centres, reach = render.means2d.detach(), render.radii[:, None]
-    meets = ((centres + reach > 16) & (centres - reach < 32)).all(1) & (render.radii > 0)
-    assert 0 < meets.sum() < 50
-    assert (grads["sh0"][~meets] == 0).all()
-    assert (grads["means"][~meets] == 0).all()
-
-
-def test_a_mask_of_all_tiles_is_no_mask():
-    g, camera = random_gaussians(50, seed=11), pinhole(40, 40)
-    masked = rasterize(g, camera, tile_mask=np.ones((3, 3), bool))
-    assert torch.equal(masked.rgb, rasterize(g, camera).rgb)

@@ -33,13 +33,6 @@ def some_state() -> TrainState:
     return state
 
 
-def change(path: Path, **arrays: np.ndarray) -> None:
-    """Replace arrays of a checkpoint."""
-    with np.load(path) as file:
-        content = {name: file[name] for name in file.files}
-    np.savez(path, **(content | arrays))  # type: ignore[arg-type]
-
-
 def test_round_trip_is_identical(tmp_path):
     state, path = some_state(), tmp_path / "run" / "checkpoint.npz"
     write_checkpoint(path, state, "these settings")
@@ -62,36 +55,31 @@ def test_round_trip_is_identical(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
-def test_other_settings_are_refused(tmp_path):
+def rewrite(path: Path, name: str, array: np.ndarray, version: int) -> None:
+    """Replace an array and the version of a checkpoint, whose checksum holds again."""
+    with np.load(path) as file:
+        content = {n: file[n] for n in file.files if n != "meta"} | {name: array}
+        meta = json.loads(str(file["meta"])) | {"version": version}
+    meta["crc32"] = _checksum(meta, content)
+    np.savez(path, **content, meta=np.array(json.dumps(meta)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "version", "says"),
+    [
+        ("grad_sum", np.ones(9, np.float32), 99, r"checkpoint version 99, this sagesplat reads \d+; delete"),
+        ("exp_avg/quats", np.full((9, 4), np.nan, np.float32), 3, r"exp_avg/quats holds NaN or Inf; delete"),
+        ("view/pose/values", np.zeros((8, 5), np.float32), 3, "not a whole checkpoint"),
+        ("view/pose/counts", np.full(8, -1), 3, "not a whole checkpoint"),
+    ],
+)
+def test_what_cannot_be_resumed_is_one_line(tmp_path, name, array, version, says):
     path = tmp_path / "checkpoint.npz"
     write_checkpoint(path, some_state(), "a")
-    with pytest.raises(
-        RunError, match=r"other settings or inputs; delete checkpoint\.npz \(or add --force\)"
-    ):
+    with pytest.raises(RunError, match=r"other settings or inputs; delete checkpoint\.npz \(or add"):
         read_checkpoint(path, "b")
-
-
-def test_other_versions_are_refused(tmp_path):
-    path = tmp_path / "checkpoint.npz"
-    write_checkpoint(path, some_state(), "a")
-    with np.load(path) as file:
-        meta = json.loads(str(file["meta"]))
-    change(path, meta=np.array(json.dumps({**meta, "version": 99})))
-    with pytest.raises(
-        RunError, match=r"checkpoint\.npz: checkpoint version 99, this sagesplat reads \d+; delete"
-    ):
-        read_checkpoint(path, "a")
-
-
-@pytest.mark.parametrize("name", ["means", "shN", "exp_avg/quats", "exp_avg_sq/sh0", "grad_sum"])
-def test_not_finite_is_refused(tmp_path, name):
-    path = tmp_path / "checkpoint.npz"
-    write_checkpoint(path, some_state(), "a")
-    with np.load(path) as file:
-        array = file[name]
-    array.flat[2] = np.nan
-    change(path, **{name: array})
-    with pytest.raises(RunError, match=rf"checkpoint\.npz: {name} holds NaN or Inf; delete"):
+    rewrite(path, name, array, version)
+    with pytest.raises(RunError, match=says):
         read_checkpoint(path, "a")
 
 
@@ -100,7 +88,6 @@ def test_not_finite_is_refused(tmp_path, name):
 )  # np.load leaves such files open
 @settings(
     max_examples=100,
-    deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
@@ -121,19 +108,3 @@ def test_damage_is_one_line_or_harmless(tmp_path, data):
         assert all(torch.isfinite(p).all() for p in state.gaussians.parameters().values())
     assert str(path) in message
     assert "\n" not in message
-
-
-@pytest.mark.parametrize(
-    ("name", "array"),
-    [("values", np.zeros((8, 5), np.float32)), ("counts", np.full(8, -1)), ("counts", np.zeros(7, np.int64))],
-)
-def test_parameters_of_views_that_do_not_fit_are_refused(tmp_path, name, array):
-    path = tmp_path / "checkpoint.npz"
-    write_checkpoint(path, some_state(), "a")
-    with np.load(path) as file:
-        content = {n: file[n] for n in file.files if n != "meta"} | {f"view/pose/{name}": array}
-        meta = json.loads(str(file["meta"]))
-    meta["crc32"] = _checksum(meta, content)
-    change(path, **{f"view/pose/{name}": array}, meta=np.array(json.dumps(meta)))
-    with pytest.raises(RunError, match="not a whole checkpoint"):
-        read_checkpoint(path, "a")

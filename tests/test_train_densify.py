@@ -179,16 +179,6 @@ def test_schedule_is_the_published_one_at_full_length():
     assert plan == published
 
 
-@pytest.mark.parametrize("steps", [1, 30, 300, 3000, 7000, 60_000])
-def test_schedule_scales_with_the_length(steps):
-    plan = schedule_of(TrainConfig(max_steps=steps, lr_schedule="published"))
-    assert plan.level_every == -(-steps // 30)
-    assert plan.refine_stop == max(1, steps // 2)
-    assert plan.reset_every == max(1500, steps // 10)  # a model needs time to come back
-    assert plan.recovery <= plan.reset_every // 2
-    assert schedule_of(TrainConfig(max_steps=steps, level_every=17)).level_every == 17
-
-
 @pytest.mark.parametrize(("steps", "stop"), [(900, 630), (2000, 1200), (3000, 1500), (30_000, 15_000)])
 def test_short_runs_of_the_fast_pace_grow_for_longer(steps, stop):
     fast, published = (

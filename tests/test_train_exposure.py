@@ -11,7 +11,6 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.scene.images import Photos
 from sagesplat.train.events import Found, Trained
 from sagesplat.train.exposure import ExposureUpdate, exposure_update, fit_exposure, transforms
-from sagesplat.train.nested import capped_config
 from sagesplat.train.trainer import begin, train
 from sagesplat.train.view_parameters import ViewParameters
 
@@ -55,20 +54,6 @@ def test_gains_are_learned_and_their_mean_is_the_identity(scene):
     assert off.per_view == {}
 
 
-def test_off_and_blocks_of_cameras_that_have_an_exposure_learn_none(scene):
-    photos = Exposed(scene.views)
-    refined = replace(
-        scene,
-        views=tuple(
-            replace(view, camera=replace(view.camera, exposure=np.eye(3, 4, dtype=np.float32)))
-            for view in scene.views
-        ),
-    )
-    assert exposure_update(scene, photos, replace(CONFIG, exposure="off")) == (None, "")
-    assert exposure_update(refined, photos, replace(CONFIG, exposure="affine")) == (None, "")
-    assert capped_config(CONFIG, 10, 10).exposure == "off"
-
-
 def test_photos_that_say_nothing_of_their_exposure_are_named(scene):
     none = np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
     fields = ("track_points", "track_views", "track_uv")
@@ -96,18 +81,6 @@ def test_updates_move_the_views_of_a_step_and_keep_the_mean():
     torch.testing.assert_close(parameters.values[rows].mean(0), torch.zeros(12))
     assert bool((parameters.values[2] < 0).all())
     assert not parameters.values[[0, 3]].any()
-
-
-def test_a_resumed_training_is_the_same(scene, tmp_path):
-    config = replace(CONFIG, exposure="affine", max_steps=24, level_every=12)
-    photos, labels = Exposed(scene.views), np.full(len(scene.points.xyz), -1, np.int16)
-    whole, _ = trained(scene, photos, config)
-    for event in train(scene, photos, labels, config, folder=tmp_path):
-        if getattr(event, "step", 0) == 13:
-            break
-    again, _ = trained(scene, photos, config, folder=tmp_path)
-    assert torch.equal(again.per_view["exposure"].values, whole.per_view["exposure"].values)
-    assert torch.equal(again.gaussians.means, whole.gaussians.means)
 
 
 def test_early_stopping_looks_through_the_exposure(scene):

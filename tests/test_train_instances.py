@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.train.instances import label
-from sagesplat.train.view_consensus import Sightings, join
+from sagesplat.train.view_consensus import Sightings
 
 TAXONOMY = Taxonomy({62: "chair", 184: "tree-merged"})
 CHAIR = 1  # column of chairs: the first one is of what is unlabelled
@@ -60,7 +60,7 @@ def model(n: int, label_id: int = 62) -> Gaussians:
     return Gaussians(z(n, 3) + torch.arange(n)[:, None], z(n, 4), z(n, 3), z(n), z(n, 1, 3), z(n, 0, 3), ids)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 1000), count=st.integers(2, 6))
 def test_numbers_of_single_views_do_not_matter(seed: int, count: int) -> None:
     objects = np.repeat(np.arange(count), range(20, 20 + count))
@@ -83,11 +83,6 @@ def test_masks_that_are_cut_or_lost_in_some_views_do_no_harm(seed: int) -> None:
     assert adjusted_rand_index(objects, found.label_ids) > 0.95
 
 
-def test_results_are_the_same_every_time() -> None:
-    sightings = seen(np.repeat(np.arange(5), 40), 16, 0.3, 0)
-    assert (join(sightings) == join(sightings)).all()
-
-
 def test_an_instance_of_one_view_stays_in_its_category() -> None:
     objects = np.repeat(np.arange(2), 30)
     sightings = seen(objects, 6, 0.0, 0)
@@ -106,15 +101,6 @@ def test_gaussians_that_no_view_sees_follow_their_neighbours() -> None:
     sightings = seen(objects, 6, 0.0, 0)
     sightings.columns[[10, 50]] = -1
     sightings.weights[[10, 50]] = 0
-    found = label(model(len(objects)), sightings, TAXONOMY)
-    assert adjusted_rand_index(objects, found.label_ids) == 1
-
-
-def test_views_that_lost_the_mask_have_no_say() -> None:
-    objects = np.repeat(np.arange(2), 30)
-    sightings = seen(objects, 8, 0.0, 0)
-    sightings.columns[objects == 0, 2:] = CHAIR  # six of eight views have no mask of it
-    sightings.columns[5, 0] = CHAIR  # beside the mask in one of the two views that have it
     found = label(model(len(objects)), sightings, TAXONOMY)
     assert adjusted_rand_index(objects, found.label_ids) == 1
 

@@ -6,26 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import pinhole, random_gaussians, write_capture
+from conftest import random_gaussians
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
-from sagesplat.raster import rasterize, set_threads
+from sagesplat.raster import set_threads
 from sagesplat.raster.reference import rotation_matrices
-from sagesplat.scene.images import Photos
 from sagesplat.train import mcmc
 from sagesplat.train.densify import PRUNE_OPACITY
-from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
-from sagesplat.train.lr_schedule import LrSchedule
-from sagesplat.train.photo_loader import PhotoLoader
-from sagesplat.train.state import TrainState, from_points, initial_state
-from sagesplat.train.stepper import Stepper
-from sagesplat.train.strategy import make_strategy
+from sagesplat.train.early_stopping import trainable_rows
+from sagesplat.train.state import TrainState, initial_state
 
-CONFIG = TrainConfig()
 DEAD = -9.0  # a logit
 
 
@@ -99,27 +92,6 @@ def test_more_than_51_are_treated_as_51():
         assert result[0] == result[1]
 
 
-@pytest.mark.parametrize(("logit", "moved", "tolerance"), [(-1.0, 3, 0.02), (0.5, 1, 0.02), (2.0, 4, 0.07)])
-def test_a_pile_renders_like_the_one_it_was(logit, moved, tolerance):
-    g = random_gaussians(moved + 1, degree=0, log_scale=-1.2)
-    g = replace(
-        g,
-        logit_opacities=torch.tensor([logit] + [DEAD] * moved),
-        means=torch.tensor([0.1, 0.2, 4.0]) + torch.arange(moved + 1)[:, None],
-        sh0=torch.ones_like(g.sh0),
-    )
-    state = state_of(g)
-    camera = pinhole()
-    before = rasterize(state.gaussians, camera).alpha.clone()
-    assert mcmc.relocate(state, all_of(state)) == moved
-    after = rasterize(state.gaussians, camera).alpha
-    assert float(before.max()) > 0.2
-    assert float((after - before).abs().max()) < tolerance
-    at = int(before.argmax())  # the centre is conserved exactly, up to where pixels and the low-pass lie
-    assert float(after.flatten()[at]) == pytest.approx(float(before.flatten()[at]), abs=0.01)
-    assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.15)
-
-
 # ---- relocation and growth
 
 
@@ -161,7 +133,7 @@ def test_hosts_are_drawn_by_opacity():
     assert shares == pytest.approx([0.1, 0.3, 0.6], abs=0.015)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(drawn=states())
 def test_relocation_keeps_counts_and_leaves_stopped_rows_alone(drawn):
     state, trainable = drawn
@@ -182,7 +154,7 @@ def test_relocation_keeps_counts_and_leaves_stopped_rows_alone(drawn):
         assert set(after["label_ids"][trainable].tolist()) == living
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(drawn=states(), most=st.integers(0, 60), rounds=st.integers(1, 4))
 def test_growth_keeps_to_the_cap_and_withholds_what_stopped(drawn, most, rounds):
     state, trainable = drawn
@@ -216,20 +188,6 @@ def test_growth_keeps_to_the_cap_and_withholds_what_stopped(drawn, most, rounds)
             assert not after["exp_avg_sq means"][row].any()
         assert all(p.is_contiguous() for p in state.gaussians.parameters().values())
         trainable = trainable_rows(state.gaussians, dict.fromkeys(stopped, 1))
-
-
-def test_chance_comes_from_the_state_alone():
-    def run(seed: int) -> TrainState:
-        state = state_of(random_gaussians(300, logit=-4), seed)
-        for _ in range(3):
-            mcmc.relocate(state, all_of(state))
-            mcmc.add(state, 1000, all_of(state))
-            mcmc.perturb(state, 0.1, all_of(state))
-        return state
-
-    first, again, other = (snapshot(run(seed)) for seed in (1, 1, 2))
-    assert all(torch.equal(first[name], again[name]) for name in first)
-    assert not torch.equal(first["means"], other["means"])
 
 
 # ---- noise
@@ -282,18 +240,6 @@ def test_the_kernel_computes_what_torch_does():
     assert (state.gaussians.means - before).abs().max() > 0.1
 
 
-def test_opaque_ones_hardly_move():
-    moved = {}
-    for opacity in (0.001, 0.005, 0.05, 0.15, 0.19, 0.5):
-        state = state_of(one_shape(1000, math.log(opacity / (1 - opacity))))
-        mcmc.perturb(state, 1.0, all_of(state))
-        moved[opacity] = float(state.gaussians.means.norm(dim=1).mean())
-    assert moved[0.001] / moved[0.005] == pytest.approx(2 / (1 + math.exp(-0.4)), rel=1e-3)
-    assert list(moved.values()) == sorted(moved.values(), reverse=True)
-    assert moved[0.19] < 1e-7 * moved[0.005]
-    assert moved[0.5] == 0
-
-
 @pytest.mark.threads
 def test_noise_is_the_same_with_any_number_of_threads_and_for_a_seed():
     results = []
@@ -332,32 +278,3 @@ def test_regularisers_have_the_gradients_that_autograd_finds():
 
 
 # ---- a small training
-
-
-def test_a_chain_learns(tmp_path):
-    truth = random_gaussians(60, seed=12, degree=0, log_scale=-1.6, logit=1.0)
-    scene = write_capture(tmp_path / "cloud", truth)
-    config = TrainConfig(max_steps=105, sh_degree=0, strategy="mcmc")
-    labels = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
-    state = initial_state(from_points(scene.points, labels, 0), seed=0)
-    feed = PhotoLoader(scene, Photos(scene.views), torch.device("cpu"))
-    rates = LrSchedule(config, scene.extent)
-    strategy = make_strategy(config, scene, rates)
-    stepper = Stepper(feed, config, ActiveTiles(scene, None), strategy=strategy)
-    losses, kept = [], torch.empty(0)
-    trainable = all_of(state)
-    for step in range(1, 106):
-        if step == 42:  # one category stops
-            state.frozen = {3: step}
-            trainable = trainable_rows(state.gaussians, state.frozen)
-            kept = state.gaussians.of_labels([3]).means.sort(0).values
-        losses.append(float(stepper(state, 0, rates.learning_rates(step), trainable)))
-        if 14 <= step < 90 and step % 7 == 0:
-            mcmc.relocate(state, trainable)
-            mcmc.add(state, 90, trainable)
-            state.sort()
-            trainable = trainable_rows(state.gaussians, state.frozen)
-    assert np.mean(losses[-7:]) < 0.65 * np.mean(losses[:7])
-    assert 80 < len(state.gaussians) <= 90 - state.withheld
-    assert state.withheld > 0
-    assert torch.equal(state.gaussians.of_labels([3]).means.sort(0).values, kept)

@@ -62,7 +62,6 @@ def test_photos_leave_room(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("groups", "files", "limits"),
     [
-        ("0::/\n", {"memory.max": "5000\n"}, [5000]),
         (
             "0::/a/b\n",
             {"memory.max": "9000\n", "a/memory.max": "4000\n", "a/b/memory.max": "max\n"},
@@ -73,10 +72,9 @@ def test_photos_leave_room(scene: Scene) -> None:
             {"memory/docker/7/memory.limit_in_bytes": "7000\n", "memory/memory.limit_in_bytes": "8000"},
             [7000, 8000],
         ),
-        ("", {"memory.max": "5000\n"}, []),
         (None, {}, []),
     ],
-    ids=["v2", "nested", "v1", "none", "nothing"],
+    ids=["v2", "v1", "nothing"],
 )
 def test_limits_of_containers(tmp_path: Path, groups, files, limits) -> None:
     if groups is not None:

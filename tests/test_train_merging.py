@@ -95,7 +95,7 @@ def test_what_nobody_sees_merges_first() -> None:
     assert into[0] != into[1]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 40), st.data())
 def test_counts_are_reached_and_all_is_finite(count: int, data: st.DataObject) -> None:
     g = _cloud(count, seed=count, degree=data.draw(st.sampled_from([0, 1, 3])))

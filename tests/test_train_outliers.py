@@ -166,12 +166,6 @@ def test_views_are_seen_before_they_are_judged():
     assert rounds == [{True}, {False}, {True}, {True}, {False}, {True}]
 
 
-@pytest.mark.parametrize("more", [{"exposure": "affine"}, {"poses": True}, {"batch": 2}])
-def test_it_goes_with_what_is_refined(scene, more):
-    _, losses = trained(scene, Figures(scene.views), replace(CONFIG, max_steps=20, outliers=True, **more))
-    assert np.isfinite(losses).all()
-
-
 def test_where_it_is_off():
     config = TrainConfig(outliers=True)
     assert not capped_config(config, 10, 10).outliers  # it is fitted to what the run's training left

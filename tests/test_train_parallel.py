@@ -77,27 +77,6 @@ def test_a_killed_pair_goes_on(capture, tmp_path):  # noqa: F811
         assert float((a - b).abs().mean()) < 1e-3 * float(a.std()), name
 
 
-def test_a_process_that_dies_is_named(capture):  # noqa: F811
-    scene, _, masks, labels = capture
-    with pytest.raises(RunError, match="process 1 of 2 ended with code"):
-        list(train_together(2, 2, scene, Broken(scene), labels, TrainConfig(max_steps=20), masks=masks))
-
-
-class Broken:
-    """Photos that only the first process can read."""
-
-    def __init__(self, scene):
-        from sagesplat.scene.images import Photos
-
-        self.photos = Photos(scene.views)
-
-    def __getitem__(self, row):
-        return self.photos[row]
-
-    def __setstate__(self, state):
-        raise SystemExit(7)
-
-
 def test_a_process_that_cannot_go_on_says_why(capture, capfd):  # noqa: F811
     scene, _, masks, labels = capture
     config = TrainConfig(max_steps=20)

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import gsplat_standin
 import numpy as np
 import pytest
 import torch
@@ -172,12 +171,6 @@ def test_training_begins_with_given_gaussians(scene):
     assert float(near.max()) < 0.1 < float(torch.pdist(start.means).median())
 
 
-def test_a_checkpoint_of_other_settings_is_refused(scene, undisturbed):
-    _, folder = undisturbed
-    with pytest.raises(RunError, match=r"made with other settings"):
-        list(run(scene, BUSY, folder=folder, settings="others"))
-
-
 def test_every_view_is_seen_once_a_round_and_test_views_never(scene):
     class Recorded(Photos):
         def __getitem__(self, index):
@@ -238,32 +231,18 @@ def test_other_strategies_learn_and_go_on_where_they_were(scene, tmp_path, confi
     assert_identical(final(again), final(whole))
 
 
-def test_mcmc_grows_to_its_cap_and_loses_nobody(scene):
-    config = replace(BUSY, strategy="mcmc", max_steps=200, max_gaussians=90, level_every=20)
-    counts = [sum(e.counts.values()) for e in run(scene, config) if isinstance(e, LevelSaved)]
-    assert counts == sorted(counts)
-    assert counts[-1] == 90
-
-
 LESS = "out of memory; lower --train.max-gaussians"
 
 
 @pytest.mark.parametrize(
     ("failure", "says"),
     [
-        (
-            torch.OutOfMemoryError("CUDA out of memory. Tried ..."),
-            LESS,
-        ),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried ..."), LESS),
         (OutOfMemory("the GPU is out of memory"), LESS),
-        (MemoryError(), LESS),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to ..."), LESS),
-        (
-            RuntimeError("CUDA error: unspecified launch failure\nmore"),
-            "the GPU failed .CUDA error: un",
-        ),
+        (RuntimeError("CUDA error: unspecified launch failure\nmore"), "the GPU failed .CUDA error: un"),
     ],
-    ids=["torch", "raster", "memory", "cpu", "device"],
+    ids=["torch", "raster", "cpu", "device"],
 )
 def test_what_a_machine_cannot_do_is_one_line_and_costs_no_checkpoint(
     scene, tmp_path, monkeypatch, failure, says
@@ -285,23 +264,6 @@ def test_what_a_machine_cannot_do_is_one_line_and_costs_no_checkpoint(
     assert "training stopped at step 29" in message
     assert str(tmp_path / "checkpoint.npz") in message
     assert next(run(scene, BUSY, folder=tmp_path, settings="s")) == Resumed(24)
-
-
-def test_other_errors_keep_their_name(scene, monkeypatch):
-    monkeypatch.setattr(stepper, "rasterize", lambda *args, **options: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        list(run(scene, BUSY))
-
-
-def test_gsplats_translation_trains_like_the_cpu(scene, monkeypatch):
-    """gsplat's own torch code stands in for its kernels, on a CPU."""
-    config = replace(BUSY, max_steps=12, level_every=12)
-    expected = [e.loss for e in run(scene, config) if isinstance(e, Step)]
-    gsplat_standin.install(monkeypatch)
-    for module in (trainer, stepper):
-        monkeypatch.setattr(module, "device_of", lambda *_: torch.device("cpu"))
-    actual = [e.loss for e in run(scene, config, backend="cuda") if isinstance(e, Step)]
-    np.testing.assert_allclose(actual, expected, rtol=1e-3)
 
 
 class Painted(Photos):
@@ -336,12 +298,9 @@ def test_nothing_is_learnt_from_pixels_that_do_not_count(scene, tmp_path):
     assert loader.rows.tolist() == [1, 2, 4, 5, 6, 7]
     half = loader.valid(2, 2)
     assert half is not None
-    assert half.shape == (16, 24)
-    assert not half[2:10, 4:15].any()
-    assert half[:2].all()
-    assert half[10:].all()
-    assert half[:, :4].all()
-    assert half[:, 15:].all()
+    expected = torch.ones(16, 24, dtype=torch.bool)
+    expected[2:10, 4:15] = False
+    assert torch.equal(half, expected)
 
 
 def test_no_gaussian_begins_at_an_ignored_point(scene):

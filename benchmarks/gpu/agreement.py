@@ -72,7 +72,6 @@ def cases() -> list[tuple[str, dict[str, Any]]]:
         ("40 channels", {"features": 40}),
         ("tile mask", {"features": 5, "tile_mask": tiles}),
         ("trainable", {"features": 5, "trainable": trainable, "tile_mask": tiles}),
-        ("absgrad", {"absgrad": True}),
     ]
 
 

@@ -25,12 +25,9 @@ def fewest_views(confidence: float) -> int:
     return math.ceil(confidence / (1 - confidence) - 1e-9)
 
 
-def conformal_quantile(values: Float[np.ndarray, " n"], confidence: float, extra: int = 0) -> float:
-    """The value that a new one does not exceed at a confidence; inf from too few values.
-
-    `extra`: ranks above the one of split conformal prediction.
-    """
-    rank = math.ceil((len(values) + 1) * confidence - 1e-9) + extra
+def conformal_quantile(values: Float[np.ndarray, " n"], confidence: float) -> float:
+    """The value that a new one does not exceed at a confidence; inf from too few values."""
+    rank = math.ceil((len(values) + 1) * confidence - 1e-9)
     return float(np.sort(values)[rank - 1]) if rank <= len(values) else math.inf
 
 

@@ -5,8 +5,9 @@ bound, which is the mean less a margin: every predictor has one of each, its mar
 so that means are compared with means and bounds with bounds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,6 +26,7 @@ from sagesplat.scene.scene import Scene
 PREDICTORS = ("constant", "eq3", "mean", "constant bound", "eq3 bound", "bound", "perfect")
 DRAWS = 1000  # of the bootstrap
 INTERVAL = (0.025, 0.975)  # quantiles of it
+Curve = Callable[[Float[np.ndarray, " V"]], Float[np.ndarray, "V K"]]  # means of each level by distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +74,13 @@ class Decisions(ColumnTable):
             "regret": _mean(self.regret[self.kept]),
         }
 
-    def interval(self, seed: int = 0) -> tuple[float, float]:
+    def interval(self) -> tuple[float, float]:
         """Of the coverage, 95 %: views drawn again with replacement, all decisions of a view together."""
         views, row = np.unique(self.view, return_inverse=True)
         accepted, kept = (np.bincount(row, of, len(views)) for of in (self.accepted, self.kept))
         if not accepted.sum():
             return np.nan, np.nan
-        drawn = np.random.default_rng(seed).integers(0, len(views), (DRAWS, len(views)))
+        drawn = np.random.default_rng(0).integers(0, len(views), (DRAWS, len(views)))
         total = accepted[drawn].sum(1)
         share = kept[drawn].sum(1)[total > 0] / total[total > 0]
         low, high = np.quantile(share, INTERVAL)
@@ -176,38 +178,28 @@ def score(
     return Decisions.joined(parts)
 
 
-class _Constant:
+def _constant(mean: Float[np.ndarray, " K"], distance: Float[np.ndarray, " V"]) -> Float[np.ndarray, "V K"]:
     """Mean of each level over the training views, at any distance."""
-
-    def __init__(self, mean: Float[np.ndarray, " K"]) -> None:
-        self.mean = monotone(mean[None])
-
-    def __call__(self, distance: Float[np.ndarray, " V"]) -> Float[np.ndarray, "V K"]:
-        return np.repeat(self.mean, len(distance), 0)
+    return np.repeat(monotone(mean[None]), len(distance), 0)
 
 
-class _Eq3:
+def _eq3(model: ViewModel, distance: Float[np.ndarray, " V"]) -> Float[np.ndarray, "V K"]:
     """The paper's model."""
-
-    def __init__(self, model: ViewModel) -> None:
-        self.curves = model.curves
-
-    def __call__(self, distance: Float[np.ndarray, " V"]) -> Float[np.ndarray, "V K"]:
-        return monotone(means_at(self.curves, distance))
+    return monotone(means_at(model.curves, distance))
 
 
 def _margins(
     observations: Observations, scene: Scene, models: Mapping[int, ViewModel]
-) -> dict[int, dict[str, tuple[_Constant | _Eq3, Calibration]]]:
+) -> dict[int, dict[str, tuple[Curve, Calibration]]]:
     """The other predictors of each category: the mean, and its calibration by the views behind the model."""
     known = np.concatenate([scene.train_ids, scene.calibration_ids])
-    means: dict[str, dict[int, _Constant | _Eq3]] = {"constant": {}, "eq3": {}}
+    means: dict[str, dict[int, Curve]] = {"constant": {}, "eq3": {}}
     left_out: dict[str, dict[int, LeftOut]] = {"constant": {}, "eq3": {}}
     for label, model in models.items():
         rows, ssim, distance, _, _ = measured_at(observations, scene, label, model.levels, known)
         heldout = np.isin(rows, scene.calibration_ids)
         seen = ssim if heldout.all() else ssim[~heldout]
-        constant, eq3 = _Constant(seen.mean(0)), _Eq3(model)
+        constant, eq3 = partial(_constant, seen.mean(0)), partial(_eq3, model)
         others = np.maximum(len(seen) - 1, 1)
         without = np.where(heldout[:, None], seen.mean(0), (seen.sum(0) - ssim) / others)
         certain = np.ones(len(rows))

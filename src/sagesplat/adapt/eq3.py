@@ -1,7 +1,7 @@
 """SSIM over viewing distance, per category and level (Eq. 3 of the paper)."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, get_args, overload
@@ -109,12 +109,7 @@ def samples(observations: Observations, train_views: np.ndarray) -> list[Samples
     return found
 
 
-def fit_models(
-    observations: Observations,
-    train_views: np.ndarray,
-    *,
-    on_fit: Callable[[SsimModel], None] | None = None,
-) -> dict[tuple[int, int], SsimModel]:
+def fit_models(observations: Observations, train_views: np.ndarray) -> dict[tuple[int, int], SsimModel]:
     """Fit Eq. 3 of the paper, SSIM over distance, to every category and level.
 
         SSIM(d) = K1 exp(-g1 |d - mu1|^a1) for d < beta, else K2 exp(-g2 |d - mu2|^a2)
@@ -124,18 +119,12 @@ def fit_models(
     Args:
         observations: Rows of `observe`. Only training views, single categories and finite SSIM are used.
         train_views: Rows of `Scene.views`.
-        on_fit: Called with each model.
 
     Returns:
         Models by (label id, level). A pair without any row has none; "not converged" is a status, not an
             error.
     """
-    models = {}
-    for found in samples(observations, train_views):
-        model = models[found.label_id, found.level] = fit_model(*found)
-        if on_fit:
-            on_fit(model)
-    return models
+    return {(found.label_id, found.level): fit_model(*found) for found in samples(observations, train_views)}
 
 
 def fit_model(

@@ -41,9 +41,7 @@ class Process:
     heldout_variance: float  # variances over that of the process
     noise: float
     weights: Float[np.ndarray, "n K"]
-    amplitudes: Float[np.ndarray, " K"]
     left_out: Float[np.ndarray, "n K"]  # mean at each view, predicted without it
-    left_out_spread: Float[np.ndarray, "n K"]  # its standard deviation
 
 
 def inputs_of(
@@ -85,7 +83,6 @@ def fit_process(
     theta = _hyperparameters(squares, heldout, values)
     inverse, _ = _inverse(_terms(squares, heldout, theta)[0])
     weights = inverse @ values
-    amplitudes = np.sqrt(_variances(values, weights))
     own = np.diag(inverse)[:, None]
     x_length, direction_length, distance_length, heldout_variance, noise = np.exp(theta).tolist()
     return Process(
@@ -93,9 +90,7 @@ def fit_process(
         heldout_variance=heldout_variance,
         noise=noise,
         weights=weights,
-        amplitudes=amplitudes,
         left_out=values - weights / own,
-        left_out_spread=amplitudes / np.sqrt(own),
     )
 
 

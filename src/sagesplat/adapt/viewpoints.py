@@ -87,16 +87,12 @@ def draw(
     sampler = _Sampler(scene, base, rule)
     cameras, sets = [], []
     for name, count in counts.items():
+        of_set = int.from_bytes(name.encode()[:8], "big")  # so that sets differ
         for number in range(count):
-            rng = np.random.default_rng([rule.seed, _number_of(name), number])
+            rng = np.random.default_rng([rule.seed, of_set, number])
             cameras.append(sampler.draw(rng))
             sets.append(name)
     return Viewpoints(rule, source, tuple(cameras), tuple(sets))
-
-
-def _number_of(name: str) -> int:
-    """A number of a set's name, so that sets differ."""
-    return int.from_bytes(name.encode()[:8], "big")
 
 
 def capture_cameras(scene: Scene) -> list[Camera]:

@@ -88,7 +88,6 @@ def rasterize(
     antialiased: bool = False,
     tile_mask: Bool[np.ndarray, "tiles_y tiles_x"] | Bool[Tensor, "tiles_y tiles_x"] | None = None,
     trainable: Bool[Tensor, " N"] | None = None,
-    absgrad: bool = False,
     pose: Float[Tensor, "6"] | None = None,
     workspace: Workspace | None = None,
     backend: Backend = "auto",
@@ -109,7 +108,6 @@ def rasterize(
         tile_mask: bool [ceil(H/16), ceil(W/16)]; tiles that are False show the background, without gradients.
         trainable: bool [N]; rows that are False are drawn, and their gradients are zero. Pass the same tensor
             at every step: `cuda` caches what it derives from it.
-        absgrad: `means2d.grad` sums the absolute gradients over pixels (AbsGS, arXiv:2404.10484).
         pose: Zeros [6] that require a gradient; it is that of a small motion of the camera in its own frame:
             x' = R x + t for x in camera coordinates, with the rotation vector `pose[:3]` (rad) and
             t = `pose[3:]` (world units). All Gaussians take part, trainable or not.
@@ -161,7 +159,6 @@ def rasterize(
         "antialiased": antialiased,
         "tile_mask": tile_mask,
         "trainable": trainable,
-        "absgrad": absgrad,
         "pose": pose,
     }
     if backend == "reference":

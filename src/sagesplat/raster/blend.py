@@ -243,11 +243,10 @@ def _pass(s, batch, rows, j, x0, y0):
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
-def _gradient(s, batch, rows, j, x0, y0, sums, absolute, slot):
+def _gradient(s, batch, rows, j, x0, y0, sums, slot):
     """One Gaussian's gradient sums over its rows of a tile; walks front to back.
 
-    Planes of s: T, what is still to come of (gradient . colour), dL/d(r, g, b), dL/dalpha. `absolute` [I, 2]
-    (or None) receives the sums of |dL/d mean|.
+    Planes of s: T, what is still to come of (gradient . colour), dL/d(r, g, b), dL/dalpha.
     """
     share_rows(s, batch, j, y0)
     red, green, blue = (
@@ -256,7 +255,7 @@ def _gradient(s, batch, rows, j, x0, y0, sums, absolute, slot):
         spread(batch, 8 * BATCH + j),
     )
     stretch = int(batch[RECORD, j])
-    s0 = s1 = s2 = t0 = tx = ty = txx = txy = tyy = across = up = splat(_ZERO)
+    s0 = s1 = s2 = t0 = tx = ty = txx = txy = tyy = splat(_ZERO)
     for band in range(BANDS):
         lo, hi = int(rows[band, 0, j]), int(rows[band, 1, j])
         if lo >= hi:
@@ -286,18 +285,9 @@ def _gradient(s, batch, rows, j, x0, y0, sums, absolute, slot):
                 r0 = r0 + gq
                 r1 = r1 + gq * spread(s, SHARED + TILE + row)
                 tyy = tyy + gq * spread(s, SHARED + 2 * TILE + row)
-                if absolute is not None:
-                    down = spread(s, SHARED + TILE + row)
-                    a, c = spread(batch, 2 * BATCH + j), spread(batch, 4 * BATCH + j)
-                    b = spread(batch, 3 * BATCH + j) * _HALF
-                    by_x, by_y = (dx * a + down * b) * gq, (dx * b + down * c) * gq
-                    across = across + maximum(by_x, -by_x)
-                    up = up + maximum(by_y, -by_y)
             lo = end
         rdx = r0 * dx
         t0, tx, ty, txx, txy = t0 + r0, tx + rdx, ty + r1, txx + rdx * dx, txy + r1 * dx
-    if absolute is not None:
-        absolute[slot, 0], absolute[slot, 1] = total(across) * -TO_CONIC, total(up) * -TO_CONIC
     store_totals(sums, slot * SUMS, s0, s1, s2, t0, tx, ty, txx, txy)
     sums[slot, 8] = total(tyy)
 
@@ -328,14 +318,14 @@ def _receive(s, row0, column0, image, left, grad_image, grad_left):
 @njit(parallel=True, cache=True)
 def backward(
     records, radii, starts, ends, ids, slots, row_order, width, image, left, grad_image, grad_left, reached,
-    sums, absolute,
+    sums,
 ):  # fmt: skip
     """Gradient sums of every intersection into sums [I, 9], at the row that `slots` gives it.
 
     image [3, H, W'] is what `forward` made; grad_image, and grad_left [H, W'] of the remaining transmittance
     (or of no rows), have zeros beyond column W. reached [I], zeros before, is 1 in the rows that are
     written: not those of Gaussians of radius 0, which take no gradient, nor those behind opaque ones.
-    `radii` [N] may have no rows: all take one. `absolute` [I, 2] or None: see `_gradient`.
+    `radii` [N] may have no rows: all take one.
     """
     tiles_x = (width + TILE - 1) // TILE
     for r in prange(len(row_order)):
@@ -354,7 +344,7 @@ def backward(
                 for j in range(last - first):
                     if len(radii) == 0 or radii[ids[first + j]] > 0:
                         slot = slots[first + j]
-                        _gradient(state, batch, rows, j, x0, y0, sums, absolute, slot)
+                        _gradient(state, batch, rows, j, x0, y0, sums, slot)
                         reached[slot] = True
                     else:
                         _pass(state, batch, rows, j, x0, y0)

@@ -30,7 +30,6 @@ class _Options:
     tile_mask: np.ndarray | None
     workspace: Workspace
     trainable: np.ndarray | None = None
-    absgrad: bool = False
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -131,8 +130,6 @@ class _Rasterize(torch.autograd.Function):
         g_opacity, g_color = space.zeros("g_opacity", n), space.zeros("g_color", n, 3)
         g_features = np.zeros((n, num_features), np.float32)
         rows, reached = space.take("sums", len(found.ids), blend.SUMS), _unreached(found, space)
-        absolute = space.take("absolute", len(found.ids), 2) if options.absgrad else None
-        g_absolute = np.zeros((n, 2), np.float32) if options.absgrad else g_mean2d
         to_pose = ctx.needs_input_grad[4]  # all Gaussians that are drawn have their share in it
         masked = options.trainable is not None and not to_pose
         moved = radii * options.trainable if masked else radii
@@ -143,18 +140,14 @@ class _Rasterize(torch.autograd.Function):
             blend.backward(
                 records, moved if masked else radii[:0], found.starts, ends, found.ids, found.slots,
                 found.row_order, camera.width, image, left, _planes(g_image, left, space),
-                g_left if first else no_left, reached, rows, absolute,
+                g_left if first else no_left, reached, rows,
             )  # fmt: skip
             g_channels = g_color if first else np.zeros((n, 3), np.float32)
             found_of = records, moved, found.offsets, reached, rows
             sums.reduce(*found_of, g_mean2d, g_conic, g_opacity, g_channels)
-            if absolute is not None:
-                sums.add_by_gaussian(found.offsets, reached, absolute, g_absolute)
             if not first:
                 part = g_features[:, _CHUNK * (index - 1) : _CHUNK * index]
                 part[:] = g_channels[:, : part.shape[1]]
-        if options.absgrad:
-            g_absolute[moved <= 0] = 0
         enough: Any = _enough(*arrays)
         gradients = [space.take(name, *a.shape) for name, a in zip(PARAMETERS, enough, strict=True)]
         num_bases = sh.num_bases(options.degree)
@@ -168,10 +161,10 @@ class _Rasterize(torch.autograd.Function):
         gradients = [g[:n] for g in gradients]
         pose = _of_pose(camera, gradients[0], d_turns[:n]) if to_pose else None
         if to_pose and options.trainable is not None:
-            for g in (g_absolute, g_features, *gradients):
+            for g in (g_mean2d, g_features, *gradients):
                 g[~options.trainable] = 0
         return (
-            None, torch.from_numpy(g_absolute), None, torch.from_numpy(g_features), pose,
+            None, torch.from_numpy(g_mean2d), None, torch.from_numpy(g_features), pose,
             *map(torch.from_numpy, gradients),
         )  # fmt: skip
 
@@ -238,7 +231,6 @@ def render(
     antialiased: bool,
     tile_mask: np.ndarray | Tensor | None,
     trainable: Tensor | None,
-    absgrad: bool,
     pose: Tensor | None,
     workspace: Workspace | None,
 ) -> Render:
@@ -250,7 +242,7 @@ def render(
     means2d = torch.zeros(len(g), 2, requires_grad=tracked)
     options = _Options(
         camera, degree, antialiased, None if tile_mask is None else np.asarray(tile_mask),
-        workspace or Workspace(), None if trainable is None else trainable.numpy(), absgrad,
+        workspace or Workspace(), None if trainable is None else trainable.numpy(),
     )  # fmt: skip
     rgb, alpha, painted, radii = _Rasterize.apply(
         options,

@@ -24,7 +24,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from sagesplat.core.errors import BackendUnavailable, DataError, OutOfMemory
+from sagesplat.core.errors import BackendUnavailable, OutOfMemory
 from sagesplat.core.extras import install
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases
@@ -276,26 +276,6 @@ class _Watch(torch.autograd.Function):
         return grads[0], grads[0]
 
 
-class _WatchAbsolute(torch.autograd.Function):
-    """A pass over the pixels; the leaf takes the sums over pixels of the absolute gradients of the 2D means.
-
-    gsplat writes them onto the means that the pass was given. In the caller's graph, whoever kept those for
-    that would keep the graph alive from inside; so the pass has a graph of its own.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, blend: Callable[..., tuple[Tensor, Tensor]], leaf: Tensor, *inputs: Tensor):
-        with torch.enable_grad():
-            ctx.inputs = [each.detach().requires_grad_() for each in inputs]
-            ctx.outputs = blend(*ctx.inputs)
-        return tuple(each.detach() for each in ctx.outputs)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor):
-        inner = torch.autograd.grad(ctx.outputs, ctx.inputs, grads, retain_graph=True)
-        return None, ctx.inputs[0].absgrad, *inner
-
-
 @cache
 def _takes_conics(isect_tiles: Callable[..., Any]) -> bool:
     """Whether it lists the tiles of the ellipse (1.6), not of its box. To ask takes 0.1 ms."""
@@ -330,7 +310,6 @@ class Tiles:
         opacities: Tensor,  # [M]
         colors: Tensor,  # [M, C]
         behind: Tensor,  # [C]
-        absgrad: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """Channels [H, W, C] of colours over what is behind, and alpha [H, W]."""
         channels = colors.shape[1]
@@ -338,7 +317,7 @@ class Tiles:
             colors, behind = pad(colors, (0, more)), pad(behind, (0, more))
         image, alpha = kernels().rasterize_to_pixels(
             means2d, conics[None], colors[None], opacities[None], *self.size, TILE, self.offsets, self.ids,
-            backgrounds=behind[None], masks=self.mask, absgrad=absgrad,
+            backgrounds=behind[None], masks=self.mask,
         )  # fmt: skip
         image, alpha = image[0, ..., :channels], alpha[0, ..., 0]
         if self.pixels is not None:  # gsplat leaves alpha as it finds it in tiles that it does not draw
@@ -358,13 +337,11 @@ def render(
     antialiased: bool,
     tile_mask: np.ndarray | Tensor | None,
     trainable: Tensor | None,
-    absgrad: bool,
     pose: Tensor | None,
 ) -> Render:
     """Render in float32 on a GPU; see `sagesplat.raster.rasterize` for the arguments.
 
-    `absgrad` sees what one pass draws: colours and at most 29 features. Raises `OutOfMemory`; a backward pass
-    raises it where `named_out_of_memory` stands around it.
+    Raises `OutOfMemory`; a backward pass raises it where `named_out_of_memory` stands around it.
     """
     splats = _project(g, camera, degree, antialiased, trainable, pose)
     drawn = (splats.radii > 0).all(-1)
@@ -377,9 +354,6 @@ def render(
         rows = splats.rows
         channels = torch.cat([channels, features if rows is None else features.index_select(0, rows)], 1)
     limit = _CHANNELS[-1]
-    if absgrad and channels.shape[1] > limit:
-        raise DataError(f"absgrad works with at most {limit - 3} features on cuda; render the others apart")
-
     mask = None if tile_mask is None else torch.as_tensor(tile_mask, device=g.means.device)
     tiles = Tiles(splats, camera, mask)
     behind = pad(background.detach().float(), (0, channels.shape[1] - 3))
@@ -387,20 +361,14 @@ def render(
     parameters = [getattr(g, name) for name in PARAMETERS]
     graphs = (*parameters, channels, splats.means2d)
     tracked = torch.is_grad_enabled() and any(p.requires_grad for p in graphs)
-    watched = leaf
     if tracked:
         leaf.requires_grad_()
         if trainable is not None:
             leaf.register_hook(lambda grad: torch.where(trainable[:, None], grad, 0.0))
         watched = (leaf if splats.rows is None else leaf.index_select(0, splats.rows))[None]
-    if tracked and absgrad:
-        blend = partial(tiles.blend, behind=behind, absgrad=True)
-        image, alpha = _WatchAbsolute.apply(blend, watched, *shapes, channels)
-    else:
-        if tracked:
-            means2d: Any = _Watch.apply(shapes[0], watched)
-            shapes = means2d, splats.conics, splats.opacities
-        image, alpha = tiles.blend(*shapes, channels[:, :limit], behind[:limit])
+        means2d: Any = _Watch.apply(shapes[0], watched)
+        shapes = means2d, splats.conics, splats.opacities
+    image, alpha = tiles.blend(*shapes, channels[:, :limit], behind[:limit])
     images = [image]
     for at in range(limit, channels.shape[1], limit):
         images.append(tiles.blend(*shapes, channels[:, at : at + limit], behind[at : at + limit])[0])

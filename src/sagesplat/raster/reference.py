@@ -4,7 +4,6 @@ Every pixel meets every Gaussian, so it serves small images only. The fast backe
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -82,18 +81,6 @@ def shade(g: Gaussians, position: Tensor, degree: int) -> Tensor:
     return ((basis[:, : coefficients.shape[1], None] * coefficients).sum(1) + 0.5).clamp_min(0)
 
 
-class _AbsoluteSums(torch.autograd.Function):
-    """Zeros for every pixel, whose gradients go back as the sum of their absolute values."""
-
-    @staticmethod
-    def forward(ctx: Any, mean2d: Tensor, height: int, width: int) -> Tensor:
-        return mean2d.new_zeros(height, width, 2)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor):
-        return grads[0].abs().sum((0, 1)), None, None
-
-
 def render(
     g: Gaussians,
     camera: Camera,
@@ -104,7 +91,6 @@ def render(
     antialiased: bool,
     tile_mask: np.ndarray | Tensor | None = None,
     trainable: Tensor | None = None,
-    absgrad: bool = False,
     pose: Tensor | None = None,
 ) -> Render:
     """Render in float64; see `sagesplat.raster.rasterize` for the arguments."""
@@ -116,8 +102,7 @@ def render(
     watched = means2d.detach().requires_grad_(means2d.requires_grad)
     if watched.requires_grad and trainable is not None:
         watched.register_hook(lambda grad: torch.where(trainable[:, None], grad, 0.0))
-    if not absgrad:
-        means2d = means2d + (watched - watched.detach())
+    means2d = means2d + (watched - watched.detach())
     channels = shade(g, -w2c[:3, :3].T @ w2c[:3, 3], degree)
     if features is not None:
         channels = torch.cat([channels, features.double()], -1)
@@ -135,8 +120,6 @@ def render(
         shown = tiles.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[: camera.height, : camera.width]
     for i in order.tolist():
         d = pixels - means2d[i]
-        if absgrad:
-            d = d + _AbsoluteSums.apply(watched[i], camera.height, camera.width)
         power = 0.5 * torch.einsum("hwi,ij,hwj->hw", d, conics[i], d)
         alpha = (opacity[i] * torch.exp(-power)).clamp_max(ALPHA_MAX)
         alpha = torch.where(shown & (alpha >= ALPHA_MIN) & (left >= TRANSMITTANCE_MIN), alpha, 0.0)

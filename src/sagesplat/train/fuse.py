@@ -1,7 +1,7 @@
 """Multi-view label fusion: all views vote on the Gaussians, whose votes are rendered into each view."""
 
 from collections.abc import Callable, Collection
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,12 @@ from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.masks import UNLABELLED, Masks, prepare_folder, write_labels, write_mask
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 
-THIN_RADIUS = 3  # px; what an opening by a disc of this radius removes is thin
-
-
-@dataclass(frozen=True)
-class FuseOptions:
-    """When the other views overrule a view."""
-
-    weight: float = 2.0  # exponent of the fused probabilities beside the view's own
-    confidence: float = 0.9  # probability of a hard label; the other categories share what remains
-    min_share: float = 0.5  # of a pixel: what the voters have to cover of it, and the winner of their votes
-    keep_thin: float = 3.0  # exponent of the view's own probabilities at thin parts; 1 = as elsewhere
+# when the other views overrule a view
+_WEIGHT = 2.0  # exponent of the fused probabilities beside the view's own
+_CONFIDENCE = 0.9  # probability of a hard label; the other categories share what remains
+_MIN_SHARE = 0.5  # of a pixel: what the voters have to cover of it, and the winner of their votes
+_KEEP_THIN = 3.0  # exponent of the view's own probabilities at thin parts
+_THIN_RADIUS = 3  # px; what an opening by a disc of this radius removes is thin
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,31 +100,30 @@ def refine(
     label_ids: Int16[np.ndarray, "H W"],
     drawn: Float32[np.ndarray, "C H W"],
     ids: Int16[np.ndarray, " C"],
-    options: FuseOptions,
 ) -> Int16[np.ndarray, "H W"]:
     """A view's label image with the votes of all views (`drawn`, see `draw`) taken into account.
 
-    A product of experts: the category with the largest log p_view + weight * log p_fused wins. p_view
-    comes from the label. A pixel keeps its label where voters cover less than
-    `min_share` of it or where the winner has less than that of their votes. An unlabelled pixel prefers no
-    category; no label is taken away.
+    A product of experts: the category with the largest log p_view + 2 log p_fused wins. p_view comes from the
+    label. A pixel keeps its label where voters cover less than half of it or where the winner has less than
+    that of their votes. An unlabelled pixel prefers no category; no label is taken away.
     """
     covered = drawn.sum(0)
     fused = drawn / np.maximum(covered, 1e-6)
-    tiny = 1 - options.confidence
-    own = np.where(label_ids == ids[:, None, None], options.confidence, tiny).astype(np.float32)
-    trust = np.where(thin_parts(label_ids), options.keep_thin, 1).astype(np.float32)
+    tiny = 1 - _CONFIDENCE
+    own = np.where(label_ids == ids[:, None, None], _CONFIDENCE, tiny).astype(np.float32)
+    trust = np.where(thin_parts(label_ids), _KEEP_THIN, 1).astype(np.float32)
     trust[label_ids == UNLABELLED] = 0
     score = trust * np.log(np.maximum(own[1:], tiny / len(ids)))
-    score += options.weight * np.log(np.maximum(fused[1:], tiny / len(ids)))
+    score += _WEIGHT * np.log(np.maximum(fused[1:], tiny / len(ids)))
     best = score.argmax(0) + 1
     share = np.take_along_axis(fused, best[None], 0)[0]
-    clear = (covered >= options.min_share) & (share >= options.min_share)
+    clear = (covered >= _MIN_SHARE) & (share >= _MIN_SHARE)
     return np.where(clear, ids[best], label_ids)
 
 
-def thin_parts(label_ids: Int16[np.ndarray, "H W"], radius: int = THIN_RADIUS) -> Bool[np.ndarray, "H W"]:
+def thin_parts(label_ids: Int16[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Pixels that an opening of their category by a disc removes: poles, legs, twigs."""
+    radius = _THIN_RADIUS
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
     disc = x**2 + y**2 <= radius**2
     thin = np.zeros(label_ids.shape, bool)
@@ -148,7 +142,6 @@ def fuse(
     *,
     views: Collection[int] | None = None,
     valid: ValidPixels = ALL_VALID,
-    options: FuseOptions | None = None,
     antialiased: bool = False,
     backend: Backend = "auto",
     on_view: Callable[[int, int], None] | None = None,
@@ -166,7 +159,6 @@ def fuse(
         target: Folder to write, in the format of `import_masks`.
         views: Rows of `Scene.views` that vote; None: the training views. All views are written.
         valid: The pixels that vote; the others get labels as unlabelled ones do.
-        options: Weights and thresholds.
         antialiased: How the model was trained.
         backend: Rasteriser; decides the device.
         on_view: Called with (views done, views in all); a view votes once and is written once.
@@ -177,7 +169,6 @@ def fuse(
     Raises:
         LabelError: If `target` is the folder of `masks`.
     """
-    options = options or FuseOptions()
     voters: Collection[int] = scene.train_ids.tolist() if views is None else views
     if target.resolve() == masks.folder.resolve():
         raise LabelError(f"{target}: these are the masks themselves; name another folder for the fused ones")
@@ -195,11 +186,17 @@ def fuse(
     for row, (view, path) in enumerate(zip(scene.views, paths, strict=True)):
         before = masks[view]
         drawn = draw(g, view.camera, votes, antialiased=antialiased, backend=backend, workspace=workspace)
-        after = refine(before, drawn, votes.ids, options)
+        after = refine(before, drawn, votes.ids)
         write_mask(path, after, masks.taxonomy)
         occurring.update(np.unique(after).tolist())
         changed.append(float((after != before).mean()))
         report(len(voters) + row + 1)
     write_labels(target, masks.taxonomy, occurring)
-    record = {**asdict(options), "changed": float(np.mean(changed))}
+    record = {
+        "weight": _WEIGHT,
+        "confidence": _CONFIDENCE,
+        "min_share": _MIN_SHARE,
+        "keep_thin": _KEEP_THIN,
+        "changed": float(np.mean(changed)),
+    }
     return Fused(np.array(changed, np.float32), record)

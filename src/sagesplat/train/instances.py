@@ -17,7 +17,7 @@ from sagesplat.segment.edit import free_id
 from sagesplat.segment.instances import NO_INSTANCE
 from sagesplat.segment.masks import UNLABELLED, Masks, Taxonomy
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
-from sagesplat.train.view_consensus import ConsensusOptions, Sightings, join
+from sagesplat.train.view_consensus import Sightings, join
 
 PhotoInstances = Callable[[View], Int16[np.ndarray, "H W"] | None]
 """The number of each pixel's instance in a view, -1 for none; None where nothing is known of the view."""
@@ -106,9 +106,7 @@ def _columns(
     return pixels, own
 
 
-def label(
-    gaussians: Gaussians, sightings: Sightings, taxonomy: Taxonomy, options: ConsensusOptions | None = None
-) -> Instances:
+def label(gaussians: Gaussians, sightings: Sightings, taxonomy: Taxonomy) -> Instances:
     """Join the 2D instances, and give each Gaussian the 3D instance that views see it in.
 
     A Gaussian has the category of its largest weight, or its own where no view sees it. It has the instance
@@ -121,12 +119,11 @@ def label(
         gaussians: The model, with categories as `label_ids`.
         sightings: What views see of it (`gather`), with the categories of `taxonomy`.
         taxonomy: The categories.
-        options: When views agree.
 
     Returns:
         Labels of the Gaussians, names of categories and instances, and what no second view confirmed.
     """
-    objects = join(sightings, options)
+    objects = join(sightings)
     ids = np.array([UNLABELLED, *sorted(taxonomy.names)], np.int16)
     of_object = np.full(int(objects.max(initial=-1)) + 1, -1, np.int64)  # category column
     of_object[objects[objects >= 0]] = sightings.categories[objects >= 0]

@@ -126,7 +126,8 @@ def _merge_round(m: _Mixture, most: int) -> _Mixture | None:
         return None
     rgb = sh0_to_rgb(torch.from_numpy(m.sh[:, :3])).numpy().astype(np.float64)
     cost = _costs(first, second, m.means, m.covs, m.opacities, rgb, m.mass, m.visible)
-    pairs = _cheapest(np.argsort(cost, kind="stable"), first, second, len(m), min(most, _at_most(len(m))))
+    most = min(most, max(1, int(_ROUND * len(m))))
+    pairs = _cheapest(np.argsort(cost, kind="stable"), first, second, len(m), most)
     i, j = first[pairs], second[pairs]
     mass = m.mass[i] + m.mass[j]
     share = (m.mass[i] / mass)[:, None]
@@ -153,10 +154,6 @@ def _merge_round(m: _Mixture, most: int) -> _Mixture | None:
     names = ("means", "covs", "opacities", "sh", "labels", "mass", "visible", "origin")
     columns = {name: np.concatenate([getattr(m, name)[alone], getattr(merged, name)]) for name in names}
     return _Mixture(**columns, into=row[m.into])
-
-
-def _at_most(count: int) -> int:
-    return max(1, int(_ROUND * count))
 
 
 def _neighbours(means: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ import signal
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Semaphore
 from pathlib import Path
@@ -18,6 +19,8 @@ from sagesplat.raster import set_threads
 from sagesplat.train.events import Event
 from sagesplat.train.group import Group
 from sagesplat.train.trainer import train
+
+_LOST_AFTER = 60.0  # seconds to wait for a process to end
 
 
 def train_together(processes: int, threads: int, *args: Any, **options: Any) -> Iterator[Event]:
@@ -76,7 +79,8 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 def _lost(workers: Sequence[BaseProcess]) -> str | None:
-    """Which process is gone, in words."""
+    """Which process is gone, in words; the connection to it is lost before it has ended."""
+    wait([worker.sentinel for worker in workers], timeout=_LOST_AFTER)
     for rank, worker in enumerate(workers, 1):
         worker.join(5)
         if worker.exitcode:

@@ -18,16 +18,12 @@ from sagesplat.kernels.jit import njit
 
 _NO_SAY, _SPLIT = -1, -2  # of a view on an instance
 
-
-@dataclass(frozen=True)
-class ConsensusOptions:
-    """When views agree. Shares are of blending weight."""
-
-    seen: float = 0.3  # of an instance: what a view has to see of it to have a say
-    covered: float = 0.5  # of what it sees: what has to be in some instance
-    contained: float = 0.8  # of that: what has to be in one instance
-    cut: float = 0.7  # of the views with a say: where more than these cut it, it is taken for several objects
-    agree: float = 0.4  # of the views that see both: those that see them as one
+# when views agree; shares are of blending weight
+_SEEN = 0.3  # of an instance: what a view has to see of it to have a say
+_COVERED = 0.5  # of what it sees: what has to be in some instance
+_CONTAINED = 0.8  # of that: what has to be in one instance
+_CUT = 0.7  # of the views with a say: where more than these cut it, it is taken for several objects
+_AGREE = 0.4  # of the views that see both: those that see them as one
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,23 +46,17 @@ class Sightings:
         return np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
 
 
-def join(sightings: Sightings, options: ConsensusOptions | None = None) -> Int32[np.ndarray, " M"]:
+def join(sightings: Sightings) -> Int32[np.ndarray, " M"]:
     """The object of each instance, from 0 on; -1 for those that views cut, and those of one view alone.
 
-    Args:
-        sightings: What the views see of the Gaussians.
-        options: When views agree.
-
-    Returns:
-        Numbers [M] of objects. The instances of an object are of one category and of two views at least.
+    The instances of an object are of one category and of two views at least.
     """
-    options = options or ConsensusOptions()
-    containers = _containers(sightings, options)
-    cut = (containers == _SPLIT).sum(1) > options.cut * (containers != _NO_SAY).sum(1)
+    containers = _containers(sightings)
+    cut = (containers == _SPLIT).sum(1) > _CUT * (containers != _NO_SAY).sum(1)
     objects, count, views = np.full(len(cut), -1, np.int32), 0, sightings.views
     for category in np.unique(sightings.categories):
         rows = np.flatnonzero((sightings.categories == category) & ~cut)
-        clusters = _cluster(*_agreement(containers[rows]), np.float32(options.agree))
+        clusters = _cluster(*_agreement(containers[rows]), np.float32(_AGREE))
         for cluster in np.unique(clusters):
             mine = rows[clusters == cluster]
             if len(np.unique(views[mine])) > 1:
@@ -74,7 +64,7 @@ def join(sightings: Sightings, options: ConsensusOptions | None = None) -> Int32
     return objects
 
 
-def _containers(sightings: Sightings, options: ConsensusOptions) -> Int32[np.ndarray, "M V"]:
+def _containers(sightings: Sightings) -> Int32[np.ndarray, "M V"]:
     """The instance of each view that contains each instance; _SPLIT where several do, _NO_SAY elsewhere."""
     columns, weights = sightings.columns[..., 0], sightings.weights[..., 0]
     mass = (weights.sum(1) / (columns >= 0).sum(1).clip(1)).astype(np.float32)
@@ -88,9 +78,9 @@ def _containers(sightings: Sightings, options: ConsensusOptions) -> Int32[np.nda
             continue
         block = shared[:, start:end]
         covered, best = block.sum(1), block.argmax(1)
-        say = (seen[:, view] >= options.seen * whole) & (covered >= options.covered * seen[:, view])
+        say = (seen[:, view] >= _SEEN * whole) & (covered >= _COVERED * seen[:, view])
         say &= covered > 0
-        one = np.take_along_axis(block, best[:, None], 1)[:, 0] >= options.contained * covered
+        one = np.take_along_axis(block, best[:, None], 1)[:, 0] >= _CONTAINED * covered
         found[say, view] = np.where(one, start + best, _SPLIT)[say]
     return found
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
-_EPS = 1e-15
+_B1, _B2, _EPS = 0.9, 0.999, 1e-15  # Adam's
 
 
 @dataclass(eq=False)
@@ -38,7 +38,6 @@ class ViewParameters:
         views: Sequence[int],
         grad: Float32[Tensor, "R D"],
         lr: float | Tensor,
-        betas: tuple[float, float] = (0.9, 0.999),
         *,
         joint: bool = False,
     ) -> None:
@@ -48,16 +47,16 @@ class ViewParameters:
             views: Rows.
             grad: Their gradients.
             lr: A number, or a tensor that broadcasts to [R, D].
-            betas: Of the two moments.
             joint: The parameters of a view share their second moment: a step keeps the gradient's direction.
         """
         rows = torch.tensor(views, device=self.values.device)
-        b1, b2 = betas
         self.counts[rows] += 1
-        unbiased1, unbiased2 = ((1 - b ** self.counts[rows][:, None].double()).to(grad.dtype) for b in betas)
-        m = b1 * self.exp_avg[rows] + (1 - b1) * grad
+        unbiased1, unbiased2 = (
+            (1 - b ** self.counts[rows][:, None].double()).to(grad.dtype) for b in (_B1, _B2)
+        )
+        m = _B1 * self.exp_avg[rows] + (1 - _B1) * grad
         squares = (grad * grad).mean(1, keepdim=True).expand_as(grad) if joint else grad * grad
-        v = b2 * self.exp_avg_sq[rows] + (1 - b2) * squares
+        v = _B2 * self.exp_avg_sq[rows] + (1 - _B2) * squares
         self.exp_avg[rows], self.exp_avg_sq[rows] = m, v
         self.values[rows] -= lr * (m / unbiased1) / ((v / unbiased2).sqrt() + _EPS)
 
