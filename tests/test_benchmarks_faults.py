@@ -100,14 +100,6 @@ def program(folder: Path, monkeypatch: pytest.MonkeyPatch, does: str) -> Asked:
     return Asked(folder / "scene", folder / "out", ("--downscale=4",))
 
 
-def test_a_command_that_fails_is_a_problem(tmp_path: Path, monkeypatch) -> None:
-    asked = program(tmp_path, monkeypatch, 'echo "sagesplat: $*" >&2; exit 2')
-    found = faults.undisturbed(asked, 1)
-    words = f"run {asked.scene} {asked.run} --downscale=4 --threads=1"
-    assert found.problems == [f"exit code 2: sagesplat: {words}"]
-    assert found.result == found.problems[0]
-
-
 def test_a_command_is_killed(tmp_path: Path, monkeypatch) -> None:
     asked = program(tmp_path, monkeypatch, 'echo "✓ lift         0.3 s  97 %"; exec sleep 60')
     with Command(asked, "a") as command:

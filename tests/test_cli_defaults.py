@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from conftest import Call
 
 from sagesplat.adapt.plan_files import read_plans
 from sagesplat.cli.console import Console
@@ -29,7 +30,6 @@ from sagesplat.stages.train import train_levels
 from sagesplat.studies.paper.snapshots import adapt_snapshots
 
 SETTINGS = "--train.max-steps 60 --train.level-every 30 --ladder snapshots --target-ssim 0.4 --test-every 6"
-Call = Callable[..., tuple[int, str]]
 
 
 class Killed(Exception):
@@ -57,23 +57,6 @@ def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(finished: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(finished, tmp_path / "run"))
-
-
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    def typed(*words: str | Path) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["sagesplat", *map(str, words)])
-        code, text = 0, ""
-        try:
-            from sagesplat import cli
-
-            cli.main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        out = capsys.readouterr()
-        return code, text + out.out + out.err
-
-    return typed
 
 
 def test_flags_of_earlier_commands_are_the_defaults(run: Path, capture: Path, command: Call) -> None:

@@ -140,27 +140,6 @@ def test_gaps_of_gsplat_and_its_compiler(gpu, monkeypatch) -> None:
     assert printed([found]).splitlines()[1].endswith(f"→ {install('sagesplat[cuda]')}")  # no markup
 
 
-def test_extras(monkeypatch, tmp_path) -> None:
-    found = doctor.extra("onnx", "no-such-package", "something")
-    assert (found.state, found.cure) == ("gap", install("sagesplat[onnx]"))
-    assert doctor.extra("test", "pytest", "tests").text.startswith("pytest ")
-    monkeypatch.setattr(doctor, "weights_path", lambda net: tmp_path / "none.npz")
-    assert doctor.lpips().cure == "sagesplat download lpips"
-    monkeypatch.setattr(doctor, "weights_path", lambda net: tmp_path)
-    assert doctor.lpips().state == "fine"
-
-
-def test_programs_that_are_not_there_or_fail_say_nothing() -> None:
-    assert doctor._output("no-such-program") == ""
-    assert doctor._output(sys.executable, "-c", "raise SystemExit(3)") == ""
-    assert doctor._output(sys.executable, "-c", "print(5)") == "5"
-
-
-def test_lines_are_not_wrapped_where_they_are_piped() -> None:
-    long = Finding("part", "gap", "word " * 40, "cure " * 40)
-    assert len(printed([long, Finding("a longer part", "fine", "yes")]).splitlines()) == 3
-
-
 def test_building_without_a_gpu_is_an_error(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

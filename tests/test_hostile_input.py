@@ -19,9 +19,7 @@ import numpy as np
 import pytest
 
 from sagesplat.core.errors import DataError, SageError
-from sagesplat.formats.increments import Increment, totals
 from sagesplat.io.npz import Npz
-from tests.fuzz.__main__ import FOLDERS
 from tests.fuzz.fuzz_reader import CORPUS
 from tests.fuzz.hostile import MIB, Finding, Reader, check, honest_memory, watchdog
 from tests.fuzz.mutate import BYTES, mutate
@@ -151,14 +149,6 @@ def test_what_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch):
     assert "Hang" in finding.kind
 
 
-def test_mutations_repeat_with_their_seed_and_stay_small():
-    content = b'{"a": [1, 2, {"b": null}], "c": "text"}'
-    assert mutate(content, [content], Random(3)) == mutate(content, [content], Random(3))
-    made = {mutate(content, [content], Random(seed)) for seed in range(300)}
-    assert len(made) > 200
-    assert max(map(len, made)) <= 20_000
-
-
 def archive(path: Path, arrays: dict[str, np.ndarray], compression: int = zipfile.ZIP_STORED) -> Path:
     with zipfile.ZipFile(path, "w", compression) as file:
         for name, array in arrays.items():
@@ -224,14 +214,6 @@ def test_a_promise_of_an_array_is_not_allocated(tmp_path: Path):
     assert peak < MIB
 
 
-def test_sums_of_chunks_that_the_run_does_not_have():
-    chunk = Increment(2, 1, "a.spz", 3, 9, 9, "0" * 64)
-    assert totals([chunk], [2], 2, "count").tolist() == [[3, 3]]
-    for labels, levels in (([5], 2), ([2], 0)):
-        with pytest.raises(DataError, match=r"a\.spz: this run has no category 2, level 1"):
-            totals([chunk], labels, levels, "count")
-
-
 def test_nothing_unpickles():
     """No pickle of anybody's: numpy and torch are told so at every call, and the module is not used."""
     calls = {r"\bnp\.load\(": "allow_pickle=False", r"\btorch\.load\(": "weights_only=True"}
@@ -241,7 +223,3 @@ def test_nothing_unpickles():
         for call, wanted in calls.items():
             for match in re.finditer(call, text):
                 assert wanted in text[match.start() : match.start() + 120], path
-
-
-def test_the_folders_that_the_fuzzer_instruments_are_there() -> None:
-    assert [name for name in FOLDERS if not (ROOT / "src" / "sagesplat" / name).is_dir()] == []

@@ -1,4 +1,4 @@
-"""The simulated CDN against references and closed forms; conservation; money; recorded visits."""
+"""The simulated CDN against references and closed forms; conservation; recorded visits."""
 
 import json
 from collections import OrderedDict
@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.common import RESULTS
 from benchmarks.scaling import __main__ as report
-from benchmarks.scaling import figures, prices, theory
+from benchmarks.scaling import figures, theory
 from benchmarks.scaling.cdn import (
     DAY,
     HIT,
@@ -154,10 +154,7 @@ def test_recorded_visits_are_read(library: Library):
     ("change", "said"),
     [
         ({"format": "else"}, "no recorded visits"),
-        ({"files": []}, "damaged"),
         ({"profiles": [{"visits": [{"requests": [[-1, 0]]}]}]}, "damaged"),
-        ({"profiles": [{"visits": [{"requests": [[0, 99]]}]}]}, "damaged"),
-        ({"profiles": None}, "damaged"),
         ({"files": [{"uri": "index.html"}] * 11}, "damaged"),
     ],
 )
@@ -182,36 +179,11 @@ def test_recordings_must_fit_together(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"viewers": 0},
-        {"pop_bytes": -1.0},
-        {"returning": 1.2},
-        {"returning": 0.7, "elsewhere": 0.7},
-        {"growth": ()},
-        {"mix": (1.0,)},
-        {"mix": (0.0, 0.0)},
-    ],
+    "change", [{"viewers": 0}, {"returning": 0.7, "elsewhere": 0.7}, {"mix": (0.0, 0.0)}]
 )
 def test_impossible_sites_are_refused(library: Library, change: dict[str, float]):
     with pytest.raises(DataError):
         simulate(library, replace(SITE, **change))  # pyright: ignore[reportArgumentType]
-
-
-def test_prices_go_by_tiers():
-    tiers = ((10.0, 2.0), (20.0, 1.0), (float("inf"), 0.5))
-    assert [prices.tiered(gb, tiers) for gb in (0, 4, 15, 40)] == [0, 8, 25, 40]
-
-
-def test_a_bill_adds_up(library: Library):
-    service = prices.Service(replace(SITE, viewers=1000), prices.Storage(), photos=100, hours_per_1000=2.0)
-    flat = prices.Prices("flat", ((float("inf"), 0.1),), 0.01, 0.02, 3.0, "a test")
-    bill = prices.bill(library, service, flat)
-    requests_, sent = theory.per_visit(library, service.site)
-    assert bill["egress"] == pytest.approx(30_000 * sent / 1e9 * 0.1)
-    assert bill["requests"] == pytest.approx(30_000 * requests_ / 1e4 * 0.01)
-    assert bill["training"] == pytest.approx(40 * 0.2 * 3.0)
-    assert prices.per_1000_visits(library, service, flat) == pytest.approx(sum(bill.values()) / 30)
 
 
 def test_days_and_figures(library: Library, capsys: pytest.CaptureFixture[str]):
@@ -219,12 +191,9 @@ def test_days_and_figures(library: Library, capsys: pytest.CaptureFixture[str]):
     assert [row["viewers"] for row in rows] == [50, 500]
     assert len(capsys.readouterr().out.splitlines()) == 2
     sweep = [row | {"pop_bytes": 1e6 * i} for i, row in enumerate(rows, 1)]
-    moved = prices.sensitivity(library, library, prices.Service(SITE, prices.Storage()))
-    assert moved[0][4] - moved[0][2] == max(abs(row[4] - row[2]) for row in moved)
     for figure in (
         figures.visits({"one": library, "two": library}),
         figures.hits(rows, {"one": sweep, "two": sweep}),
-        figures.sensitivity(moved, 0.04),
     ):
         figure.canvas.draw()
 

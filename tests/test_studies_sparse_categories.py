@@ -15,7 +15,6 @@ from sagesplat.adapt.plan_files import read_plans
 from sagesplat.adapt.viewpoint import read_promises
 from sagesplat.core.config import (
     CompareConfig,
-    LadderKind,
     NestConfig,
     PaperConfig,
     PlanConfig,

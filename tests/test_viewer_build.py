@@ -11,7 +11,7 @@ from pathlib import Path
 
 import browser as chromium
 import pytest
-from test_viewer_browser import serve, three_walls
+from test_viewer_browser import FRAMES, serve, three_walls
 
 import sagesplat
 from sagesplat.viewer.built import package_viewer
@@ -169,7 +169,7 @@ def test_two_viewers_in_a_foreign_page(packed: Path, tmp_path: Path) -> None:
         first, second = page.evaluate(poses)
         assert first != second
         page.keyboard.down("w")  # of the page, which has the focus
-        page.wait_for_timeout(300)
+        page.evaluate(FRAMES, 20)
         page.keyboard.up("w")
         assert page.evaluate(poses) == [first, second]
         page.focus("#two canvas")

@@ -4,7 +4,6 @@ import gzip
 import shutil
 import socket
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import browser
@@ -223,13 +222,6 @@ def test_who_leaves_stops_the_reading_of_the_file(bundle: Path, viewer: Path):
         connection.close()
         wait_for(lambda: ended)
     (bundle / "endless.spz").unlink()
-
-
-@pytest.mark.slow
-def test_two_hundred_at_once(port: int):
-    names = [list(FILES)[index % len(FILES)] for index in range(200)]
-    with ThreadPoolExecutor(200) as pool:
-        assert all(pool.map(lambda name: ask(port, "/" + name)[2] == FILES[name], names))
 
 
 PAGE = b"""<!doctype html><title>page</title><link rel=stylesheet href=assets/look-1a2b3c4d.css>
