@@ -2,11 +2,9 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gsplat
-import gsplat_standin
 import numpy as np
 import pytest
 import torch
@@ -84,26 +82,6 @@ def test_a_check_that_fails_does_not_keep_others_from_running(tmp_path, monkeypa
     assert script.check(base.Asked(tmp_path / "capture", device="cpu", only=("three",))) == 2
 
 
-def test_a_lost_device_leaves_the_rest_to_a_new_process(tmp_path, monkeypatch):
-    commands = []
-
-    def run(command, **options):
-        commands.append(command)
-        (tmp_path / "two.json").write_text(json.dumps({"state": "ok", "line": "well"}))
-
-    monkeypatch.setattr(script.subprocess, "run", run)
-    asked = base.Asked(Path("scene"), minutes=5.0, out=tmp_path, write=True, masks=Path("labels"))
-    bench = SimpleNamespace(asked=asked, left=lambda: 120.0)
-    found = script.anew(bench, ["two", "three"])  # type: ignore[arg-type]
-    assert found["two"] == base.Outcome("ok", "well")
-    assert found["three"].state == "FAILED"
-    (command,) = commands
-    assert command[1:5] == ["-m", "benchmarks.gpu", "--scene", "scene"]
-    assert command[command.index("--only") :] == ["--only", "two", "three"]
-    assert command[command.index("--minutes") + 1] == "1.5"
-    assert "--write" in command
-
-
 def test_targets_are_what_so_many_labels_have_reached():
     reached = {1: 0.9019, 2: 0.8, 3: 0.7, 4: 0.6, 5: 0.5, 6: 0.4007}
     found = runs.targets(reached)
@@ -111,15 +89,6 @@ def test_targets_are_what_so_many_labels_have_reached():
     for name, share in (("third", 2), ("two_thirds", 4), ("all", 6)):
         assert sum(ssim >= found[name] for ssim in reached.values()) == share
     assert runs.targets({1: 0.75}) == {"third": 0.75, "two_thirds": 0.75, "all": 0.75}
-
-
-def test_binning_is_timed_over_the_cuda_backend(tmp_path, monkeypatch):
-    gsplat_standin.install(monkeypatch)
-    scene = write_capture(tmp_path / "capture", random_gaussians(20))
-    bench = SimpleNamespace(scene=scene, device=torch.device("cpu"))
-    found = split.binning(bench, random_gaussians(20))  # type: ignore[arg-type]
-    assert found["intersections"] > 20
-    assert found["host_ms"] > 0
 
 
 # --- gsplat's recipe -------------------------------------------------------------------------------------

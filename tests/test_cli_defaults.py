@@ -14,9 +14,9 @@ from conftest import Call
 
 from sagesplat.adapt.plan_files import read_plans
 from sagesplat.cli.console import Console
-from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, TrainConfig
+from sagesplat.core.config import FitConfig, PlanConfig, TrainConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import Event, Progress, StageDone, StageSkipped, Training, Warned
+from sagesplat.core.events import Event, StageDone, StageSkipped, Training, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json
@@ -25,7 +25,6 @@ from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import pipeline, preflight, train
 from sagesplat.stages import plan as plan_stage
-from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.train import train_levels
 from sagesplat.studies.paper.snapshots import adapt_snapshots
 
@@ -229,43 +228,6 @@ def test_a_swap_that_is_killed_is_finished_by_the_same_command(
     assert sorted(files(paths.levels)) == ["000020.npz", "000040.npz"]
     assert len(read_level(paths.levels / "000040.npz"))
     assert not paths.replacement.path.exists()
-
-
-def test_a_killed_training_gives_its_settings_to_the_next_command(capture: Path, tmp_path: Path) -> None:
-    def kill(event: Event) -> None:
-        if isinstance(event, Training) and event.step == 25:
-            raise Killed
-
-    config = replace(pipeline.DEMO, train=TrainConfig(max_steps=50, level_every=10))
-    with pytest.raises(Killed):
-        pipeline.run_all(Job(RunDir(tmp_path / "run"), kill, "cpu"), capture, config)
-    assert recorded_settings(RunDir(tmp_path / "run"))["train"] == config.train
-
-
-def test_a_killed_forced_nest_resumes_and_the_earlier_ladder_stays(run: Path) -> None:
-    paths = RunDir(run)
-    first = NestConfig(steps=20, base_steps=20, levels=3)
-    nest_levels(job(run, print), first, 0)
-    ladder, record = paths.prefixes.read_bytes(), paths.provenance("nest").read_bytes()
-    other, saves = replace(first, steps=24), []
-
-    def kill(event: Event) -> None:
-        if isinstance(event, Progress) and event.name == "nest" and event.done == 15:
-            raise Killed
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sagesplat.train.nested._SAVE_EVERY", 10)
-        with pytest.raises(Killed):
-            nest_levels(job(run, kill), other, 0)
-        assert (paths.prefixes.read_bytes(), paths.provenance("nest").read_bytes()) == (ladder, record)
-        nest_levels(job(run, saves.append), other, 0)
-    steps = [e.done for e in saves if isinstance(e, Progress) and e.name == "nest"]
-    assert min(steps) == 11
-    assert read_json(paths.provenance("nest"))["settings"]["steps"] == 24
-    (done,) = [e for e in saves if isinstance(e, StageDone)]
-    assert "SSIM 0." in done.lines[1]
-    assert "before rounding" in done.lines[1]
-    assert "costs" not in "".join(done.lines)
 
 
 def test_snapshots_are_adapted_with_the_settings_of_the_nested_levels(run: Path) -> None:

@@ -81,12 +81,6 @@ def test_a_name_that_may_be_is_not_repaired(name: str) -> None:
         assert repaired(name) == "scene"
 
 
-@pytest.mark.parametrize("name", [".", "..", "..."])
-def test_dots_are_no_file(name: str) -> None:
-    assert checked(name) == name
-    assert repaired(name) == "scene"
-
-
 @given(ANY, st.integers(0, 300))
 def test_clipping_counts_bytes(text: str, nbytes: int) -> None:
     assert len(clipped(text, nbytes).encode("utf-8", "ignore")) <= nbytes
@@ -102,11 +96,6 @@ def test_slugs_are_short_and_distinct(names: list[str]) -> None:
     found = slugs(dict(enumerate([*names, "tree", "Tree", "tree--1", "日本語"])))
     assert len(set(found.values())) == len(found)
     assert all(re.fullmatch(r"[a-z0-9-]{1,66}", slug) for slug in found.values())
-
-
-def test_slugs_of_common_names_read_like_them() -> None:
-    names = {-1: "unlabelled", 3: "dining table", 184: "sky-other-merged@2"}
-    assert slugs(names) == {-1: "unlabelled", 3: "dining-table", 184: "sky-other-merged-2"}
 
 
 @given(ANY)

@@ -128,13 +128,6 @@ def test_what_saves_requests_to_the_origin(library: Library, day: Outcome, chang
     assert simulate(library, replace(SITE, **change)).origin < day.origin  # pyright: ignore[reportArgumentType]
 
 
-def test_without_a_shield_the_origin_hears_of_every_miss(library: Library, day: Outcome):
-    bare = simulate(library, replace(SITE, shield_bytes=0.0))
-    assert bare.origin == bare.pop[MISS] + bare.pop[VALIDATED]
-    assert bare.origin_bytes > day.origin_bytes
-    assert bare.egress == day.egress
-
-
 def test_recorded_visits_are_read(library: Library):
     assert library.names == ("tiny", "tiny")
     assert (library.visits, library.profiles) == (4, ("everything", "target 0.8"))
@@ -165,25 +158,6 @@ def test_damaged_recordings_are_refused_in_one_line(tmp_path: Path, change: dict
         read([path])
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_recordings_must_fit_together(tmp_path: Path):
-    path = tmp_path / "visits.json"
-    content = json.loads(VISITS.read_text())
-    content["profiles"][0]["visits"].pop()
-    path.write_text(json.dumps(content))
-    with pytest.raises(DataError, match="not those of"):
-        read([VISITS, path])
-    with pytest.raises(DataError, match="at least one"):
-        read([])
-
-
-@pytest.mark.parametrize(
-    "change", [{"viewers": 0}, {"returning": 0.7, "elsewhere": 0.7}, {"mix": (0.0, 0.0)}]
-)
-def test_impossible_sites_are_refused(library: Library, change: dict[str, float]):
-    with pytest.raises(DataError):
-        simulate(library, replace(SITE, **change))  # pyright: ignore[reportArgumentType]
 
 
 def test_days_and_figures(library: Library, capsys: pytest.CaptureFixture[str]):
