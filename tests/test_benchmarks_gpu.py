@@ -63,25 +63,6 @@ def test_a_machine_without_a_gpu_says_so_in_one_line(capsys):
     assert "; " in line or " or use --device cpu" in line
 
 
-def test_a_check_that_fails_does_not_keep_others_from_running(tmp_path, monkeypatch, capsys):
-    def broken(bench: base.Bench) -> base.Outcome:
-        raise RuntimeError("first line\nsecond line")
-
-    def fine(bench: base.Bench) -> base.Outcome:
-        return base.Outcome("ok", "well")
-
-    monkeypatch.setattr(script, "CHECKS", {"one": broken, "two": fine})
-    write_capture(tmp_path / "capture", random_gaussians(40))
-    assert script.check(base.Asked(tmp_path / "capture", device="cpu", out=tmp_path / "out")) == 1
-    printed = capsys.readouterr().out
-    assert printed.splitlines()[-2:] == [
-        "one        FAILED   RuntimeError: first line",
-        "two        ok       well",
-    ]
-    assert "no categories: " in printed
-    assert script.check(base.Asked(tmp_path / "capture", device="cpu", only=("three",))) == 2
-
-
 def test_targets_are_what_so_many_labels_have_reached():
     reached = {1: 0.9019, 2: 0.8, 3: 0.7, 4: 0.6, 5: 0.5, 6: 0.4007}
     found = runs.targets(reached)

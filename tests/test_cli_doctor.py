@@ -12,7 +12,6 @@ from rich.console import Console
 from sagesplat import cli
 from sagesplat.cli import doctor
 from sagesplat.cli.doctor import Finding
-from sagesplat.core.errors import BackendUnavailable
 from sagesplat.core.extras import install
 from sagesplat.raster import cuda
 
@@ -105,21 +104,6 @@ def test_a_machine_with_a_gpu(gpu, monkeypatch) -> None:
     monkeypatch.setattr(cuda, "compiled", lambda: gpu / "csrc.so")
     monkeypatch.setattr(doctor, "_error", lambda backend: {"cuda": 2e-5}[backend])
     assert doctor.gsplat_kernels(build=False).text.startswith("agree with the reference to 2e-05")
-
-
-def test_building_now(gpu, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(doctor, "_error", lambda backend: 2e-5)
-    monkeypatch.setattr(cuda, "kernels", lambda: print("compiling"))
-    assert doctor.gsplat_kernels(build=True).state == "fine"
-    assert capsys.readouterr() == ("", "compiling\n")
-
-    def fail() -> None:
-        raise BackendUnavailable("they do not compile") from RuntimeError("nvcc fatal\nline 2")
-
-    monkeypatch.setattr(cuda, "kernels", fail)
-    found = doctor.gsplat_kernels(build=True)
-    assert (found.state, found.text) == ("gap", "they do not compile")
-    assert capsys.readouterr().err == "nvcc fatal\nline 2\n"
 
 
 def test_gaps_of_gsplat_and_its_compiler(gpu, monkeypatch) -> None:

@@ -66,12 +66,6 @@ def test_remaining_time_does_not_jump_with_the_time_of_a_step() -> None:
     assert told[-1][0] == 0
 
 
-def test_a_stage_that_resumes_does_not_count_what_was_done() -> None:
-    estimate = Remaining()
-    assert estimate(0.0, 900, 1000) is None
-    assert estimate(10.0, 910, 1000) == pytest.approx(90)
-
-
 def test_a_log_gets_few_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])

@@ -36,6 +36,7 @@ def test_awkward_names_are_names(name: str) -> None:
         (3, "no text"), (None, "no text"), ("", "blank"), (" ", "blank"), ("\u3164\u2800", "blank"),
         ("\u0301", "blank"), (" a", "space"), ("a\u00a0", "space"), ("x" * 101, "101 characters"),
         ("\x9b", "U+009B"), ("a\u202eb", "U+202E"), ("a\u2066b", "U+2066"), ("a\u200bb", "U+200B"),
+        ("a\nb", "U+000A"), ("a\ud800", "not UTF-8"),
     ],
 )  # fmt: skip
 def test_what_is_no_name(name: object, why: str) -> None:

@@ -269,12 +269,6 @@ def test_a_rotation_of_zeros_is_refused():
         encode_spz(one(quats=[0.0, 0, 0, 0]))
 
 
-@pytest.mark.parametrize("size", [1e-30, 1e30])
-def test_rotations_of_any_length(size):
-    g = one(quats=[size, -size, size / 2, 0.0])
-    assert torch.allclose(rotations(decode_spz(encode_spz(g)).quats), rotations(g.quats), atol=2e-3)
-
-
 @settings(max_examples=60)
 @given(values=st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=62, max_size=62))
 def test_any_finite_values_are_written_or_refused(values):
@@ -325,11 +319,6 @@ def test_other_files_are_refused(tmp_path, content, message):
     (tmp_path / "a.spz").write_bytes(content)
     with pytest.raises(DataError, match=rf"a\.spz: .*{message}"):
         read_spz(tmp_path / "a.spz")
-
-
-def test_a_wrong_checksum_is_refused():
-    with pytest.raises(DataError, match="incorrect data check"):
-        decode_spz(GOOD[:-8] + bytes([GOOD[-8] ^ 1]) + GOOD[-7:])
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

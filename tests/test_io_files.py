@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from sagesplat.core.errors import RunError
-from sagesplat.io import lock
 from sagesplat.io.files import atomic_folder, atomic_path, read_json, unwritable, write_json, write_text
 
 
@@ -132,23 +131,6 @@ def test_one_of_three_writers_of_a_folder_has_it(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [folder]
     replaced(folder, "mine")
     assert [path.name for path in folder.iterdir()] == ["mine"]
-
-
-def test_a_lock_that_was_removed_meanwhile_counts_for_nothing(tmp_path: Path, monkeypatch) -> None:
-    """Its holder was about to leave when it was opened; the one that is there then is the other's."""
-    taken, take, file = [], lock._take, tmp_path / ".a.lock"
-
-    def late(handle: int) -> None:
-        if not taken:
-            file.unlink()
-        taken.append(handle)
-        take(handle)
-
-    monkeypatch.setattr(lock, "_take", late)
-    with lock.alone(tmp_path / "a"):
-        assert len(taken) == 2
-        assert file.exists()
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("content", [None, b"{", b"\xff\xfe"])

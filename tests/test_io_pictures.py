@@ -16,7 +16,6 @@ from PIL import Image, ImageFile
 import sagesplat
 from sagesplat.core.errors import SceneError
 from sagesplat.core.extras import install
-from sagesplat.io import pictures
 from sagesplat.io.pictures import open_picture
 from sagesplat.scene._prepare import prepare_photos
 from sagesplat.scene.images import as_rgb, load_photo, photo_size
@@ -119,7 +118,7 @@ def test_heic_without_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_a_pipe_is_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.png")
-    assert "(it is no regular file)" in refused(lambda: photo_size(tmp_path / "a.png"))
+    assert "(no regular file)" in refused(lambda: photo_size(tmp_path / "a.png"))
 
 
 def test_bombs_are_refused_before_they_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,12 +151,6 @@ def test_a_huge_jpeg_is_decoded_at_reduced_size(tmp_path: Path, monkeypatch: pyt
     Image.fromarray(ramp).save(tmp_path / "a.jpg", quality=95)
     expected = ramp.reshape(60, 20, 80, 20, 3).mean(axis=(1, 3))
     assert np.abs(load(tmp_path / "a.jpg", 80, 60) - expected).max() < 3
-
-
-def test_a_white_render_is_fine(tmp_path: Path) -> None:
-    Image.new("RGB", (4000, 3000), (255, 255, 255)).save(tmp_path / "a.png")
-    assert (tmp_path / "a.png").stat().st_size < 50_000
-    assert (load(tmp_path / "a.png", 40, 30) == 255).all()
 
 
 @pytest.mark.parametrize(
@@ -287,16 +280,6 @@ def test_tags_of_a_tiff(tmp_path: Path, tags: list[tuple[int, int, int, bytes]],
         assert (load(tmp_path / "a.tif", 10, 10) == 0).all()
 
 
-def test_a_fax_is_no_photo(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Of its damaged rows libtiff printed a line each."""
-    Image.new("1", (64, 4000)).save(tmp_path / "a.tif", compression="group4")
-    content = bytearray((tmp_path / "a.tif").read_bytes())
-    content[8:60] = bytes(range(52))
-    (tmp_path / "a.tif").write_bytes(content)
-    assert "(a TIFF packed as group4); convert it to PNG" in refused(lambda: load(tmp_path / "a.tif"))
-    assert capfd.readouterr() == ("", "")
-
-
 def plainly(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
     """`as_rgb` of the whole image at once."""
     if image.mode.startswith("I") or image.mode == "F":
@@ -370,11 +353,3 @@ def test_a_prepared_photo_from_elsewhere_is_made_again(tmp_path: Path) -> None:
     os.utime(prepared, ns=(mtime, mtime))
     prepare_photos(photos, tmp_path / "t", tmp_path / "t", lambda done, total: None)
     assert prepared.read_bytes() == expected
-
-
-def test_every_promised_suffix_has_a_format() -> None:
-    from sagesplat.scene.detect import PHOTOS
-
-    Image.init()
-    known = {suffix: kind for suffix, kind in Image.EXTENSION.items() if kind in pictures.PHOTO_FORMATS}
-    assert PHOTOS - set(known) <= {".heic", ".heif"}

@@ -88,12 +88,6 @@ def test_files_without_a_hash_are_asked_for_again():
     assert requests(files, sizes, 9.0, unhashed=1, ttl=3.0).tolist() == [7, 0, 2, 1]
 
 
-def test_who_asks_while_a_fetch_is_under_way_shares_it():
-    files, sizes = np.zeros(10, int), np.array([5])
-    assert requests(files, sizes, 9.0, fill=2.5).tolist() == [7, 2, 0, 1]
-    assert requests(files, sizes, 9.0, fill=2.5, coalesce=0).tolist() == [7, 0, 0, 3]
-
-
 def test_no_byte_and_no_request_is_lost(day: Outcome):
     assert day.asked == day.browser + day.pop.sum()
     assert day.asked_bytes == day.browser_bytes + day.unsent_bytes + day.pop_bytes.sum()

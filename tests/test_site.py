@@ -3,11 +3,8 @@
 import re
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from functools import partial
 from html import unescape
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
@@ -101,19 +98,3 @@ def test_search_finds_a_flag_from_the_disk(site, browser):
         found = opened.wait_for("document.querySelectorAll('#search-results li a').length")
         assert found > 0
         assert opened.complaints == []
-
-
-@pytest.mark.slow
-def test_scenes_of_the_gallery_are_live(site, browser):
-    if not any((site / "gallery").glob("*.html")):
-        pytest.skip("no scenes in build/gallery; `make gallery` makes one")
-    handler = partial(SimpleHTTPRequestHandler, directory=str(site))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}/gallery.html"
-        with open_page(address, (700, 500), browser=browser) as opened:
-            inside = "document.querySelector('iframe.bundle').contentWindow.sagesplat"
-            opened.page.evaluate("document.querySelector('iframe.bundle').scrollIntoView()")
-            assert opened.wait_for(f"{inside} && {inside}.ready.then(() => {inside}.state().count > 0)", 60)
-            assert opened.complaints == []
-        server.shutdown()

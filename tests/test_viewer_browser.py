@@ -608,18 +608,6 @@ def test_a_lost_context_is_said(site: str, browser: Any) -> None:
         assert "GPU context was lost" in message(opened)
 
 
-@pytest.mark.slow
-def test_a_window_without_area_waits(site: str, browser: Any) -> None:
-    with open_page(f"{site}?ui=0", (1, 1), browser=browser) as opened:
-        opened.page.evaluate("document.getElementById('view').style.setProperty('height', '0px')")
-        ready(opened)
-        opened.page.set_viewport_size({"width": 320, "height": 200})
-        opened.page.evaluate("document.getElementById('view').style.removeProperty('height')")
-        opened.page.evaluate("sagesplat.goTo(0)")
-        assert settled(opened).shape == (200, 320, 3)
-        assert opened.complaints == []
-
-
 # a scene in blocks
 
 

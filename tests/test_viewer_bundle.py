@@ -220,14 +220,6 @@ def test_a_model_that_is_sent_predicts_the_same(quality, seed: int, views: int) 
     assert_close_means(read, made, *nowhere)
 
 
-def test_two_photos_from_one_place_can_be_sent() -> None:
-    made = model(3, 12, [1, 2])
-    inputs = made.inputs.copy()
-    inputs[1:4] = inputs[0]
-    made = replace(made, inputs=inputs, weights=made.weights / 4)
-    assert_close_means(read_model(sent(made), made.label_id), made, *own_views(made))
-
-
 def test_of_very_many_views_some_are_sent_and_thresholds_allow_for_it(monkeypatch) -> None:
     made = model(5, 40, [1, 2, 4])
     monkeypatch.setattr(promises, "MOST_VIEWS", 16)
@@ -269,13 +261,6 @@ def test_the_first_frame_knows_a_mean_and_a_bound_for_all_viewpoints() -> None:
     assert ((told.bound >= np.array(entry["bound"])).mean(0) >= 0.95).all()
     assert entry["bound"][-1] == 1
     assert quality_entry(replace(made, calibration=NO_CALIBRATION))["bound"] is None
-
-
-def test_a_camera_there_and_back() -> None:
-    camera = pinhole(64, 48)
-    back = frames.camera_at(frames.position(camera), frames.quaternion(camera), frames.fov_y(camera), 64, 48)
-    np.testing.assert_allclose(back.w2c, camera.w2c, atol=1e-5)
-    assert back.K[1, 1] == pytest.approx(camera.K[1, 1])
 
 
 def test_the_first_view_is_level() -> None:

@@ -174,20 +174,6 @@ def test_instances_are_a_tree_and_fold_back(editing: Opened) -> None:
 
 
 @browser_test
-def test_bad_names_and_foreign_files_are_said(editing: Opened, tmp_path: Path) -> None:
-    page = editing.page
-    choose(editing, "grass")
-    for name, why in (("x" * 300, "300 characters"), ("chair 1", "is taken"), (" ", "blank")):
-        page.get_by_label("Name", exact=True).fill(name)
-        page.locator(".editor button", has_text="Rename").click()
-        assert why in said(editing)
-    foreign = {"format": "sagesplat-label-edits", "version": 1, "ladder": "0" * 64, "operations": []}
-    (tmp_path / "foreign.json").write_text(json.dumps(foreign))
-    page.set_input_files(".editor input[type=file]", tmp_path / "foreign.json")
-    editing.wait_for("document.querySelector('.picked').textContent.includes('another run')")
-
-
-@browser_test
 def test_a_phone_has_room_for_all_of_it(bundle: Path, browser: Any) -> None:
     with serve(bundle) as url, open_page(url, (360, 740), browser=browser, touch=True) as opened:
         ready(opened, 1)

@@ -1,7 +1,6 @@
 """Readers of what lies in a run folder, a bundle or a study: JSON, CSV and TOML."""
 
 import json
-from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
@@ -48,7 +47,18 @@ from sagesplat.train.sky import Shell, Sky, read_sky, write_sky
 from sagesplat.viewer.bundle import is_bundle
 from tests.fuzz.hostile import MIB, Reader
 from tests.fuzz.readers.captures import points
-from tests.fuzz.readers.making import PHOTOS, as_json, file, put, put_photos, written
+from tests.fuzz.readers.making import (
+    PHOTOS,
+    Make,
+    as_json,
+    documents,
+    file,
+    noted,
+    put,
+    put_photos,
+    written,
+    written_by,
+)
 from tests.fuzz.readers.splats import CHUNK, checkpoints
 
 MEASURED = dict.fromkeys(("plain", "exposed", "cc"), 20.5)
@@ -71,26 +81,10 @@ scenes.plot = "demo"
 variants.track = {}
 variants.published.train.lr_schedule = "published"
 """
-Make = Callable[[Path, int], list[bytes]]
 
 
 def _ignore(event: Event) -> None:
     pass
-
-
-def _of(*documents: Callable[[int], Any]) -> Make:
-    """Makers of JSON: a document by size, or several."""
-    return lambda folder, size: as_json(*(document(size) for document in documents))
-
-
-def _noted(entries: Mapping[str, Any]) -> Make:
-    """A document with these entries, and with as many others as the size says."""
-    return _of(lambda size: {**entries, **{f"note{i}": i for i in range(size - 1)}})
-
-
-def _written(name: str, write: Callable[[Path, int], Any]) -> Make:
-    """What a function writes to a path, by size."""
-    return lambda folder, size: [written(folder / name, lambda path: write(path, size))]
 
 
 def _refined(folder: Path, size: int) -> list[bytes]:
@@ -134,7 +128,7 @@ def _write_viewpoints(path: Path, size: int) -> None:
     viewpoints.write_viewpoints(path, drawn)
 
 
-_viewpoints = _written("v.json", _write_viewpoints)
+_viewpoints = written_by("v.json", _write_viewpoints)
 
 
 def _camera_files(folder: Path, size: int) -> list[bytes]:
@@ -182,7 +176,7 @@ def _read_plans(path: Path) -> None:
 def _table(kind: Any) -> Make:
     """Makers of the CSV files of a kind of table."""
     row = dict.fromkeys((field.name for field in fields(kind)), 1)
-    return _written("t.csv", lambda path, size: from_rows(kind, [row] * 2 * size).write_csv(path))
+    return written_by("t.csv", lambda path, size: from_rows(kind, [row] * 2 * size).write_csv(path))
 
 
 def _write_partition(path: Path, size: int) -> None:
@@ -326,7 +320,7 @@ def _write_edited(path: Path, size: int) -> None:
 OPTIONS = {"masks": "/p", "classes": None, "segmenter": "onnx", "keep": ["sky"]}
 NETWORK = {"segmenter": "onnx", "model": "0" * 64}
 READERS = (
-    Reader("json", ".json", _of(lambda n: {"a": [1, "x", None, 1.5] * n}, lambda n: [[], {}]),
+    Reader("json", ".json", documents(lambda n: {"a": [1, "x", None, 1.5] * n}, lambda n: [[], {}]),
            file("m.json", read_json)),
     Reader("models", ".json", _models, file("models.json", eq3.read_models)),
     Reader("promises", ".json", _promises, file("promises.json", viewpoint.read_promises)),
@@ -336,53 +330,53 @@ READERS = (
     Reader("cameras", ".json", _cameras,
            file("path.json", lambda p: viewpoints.read_cameras(p, CAMERA)), 100),
     Reader("refined", ".npz", _refined, file("cameras.npz", _read_refined), 1000),
-    Reader("sky", ".npz", _written("s.npz", _write_sky), file("sky.npz", read_sky), 1000),
-    Reader("refined-figures", ".json", _noted(FIGURES), file("refined.json", read_refined_figures), 3000),
-    Reader("floaters", ".json", _noted(FLOATERS), file("floaters.json", read_clean_figures), 3000),
-    Reader("sampled", ".npz", _written("f.npz", _write_sampled),
+    Reader("sky", ".npz", written_by("s.npz", _write_sky), file("sky.npz", read_sky), 1000),
+    Reader("refined-figures", ".json", noted(FIGURES), file("refined.json", read_refined_figures), 3000),
+    Reader("floaters", ".json", noted(FLOATERS), file("floaters.json", read_clean_figures), 3000),
+    Reader("sampled", ".npz", written_by("f.npz", _write_sampled),
            file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),
     Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 1000),
     Reader("evaluation", ".csv", _table(Evaluation), file("e.csv", read_evaluation), 1000),
     Reader("cross-view", ".csv", _table(CrossView), file("c.csv", read_cross_view), 1000),
     Reader("same-size", ".csv", _table(SameSize), file("s.csv", read_same_size), 1000),
-    Reader("partition", ".json", _written("b.json", _write_partition),
+    Reader("partition", ".json", written_by("b.json", _write_partition),
            file("b.json", _read_partition), 10_000),
     Reader("sweep", ".toml", _sweep, file("s.toml", read_sweep), 300, 16 * MIB),
-    Reader("comparison", ".json", _written("c.json", _write_comparison),
+    Reader("comparison", ".json", written_by("c.json", _write_comparison),
            file("compare.json", read_comparison)),
     Reader("scene", ".json", _scenes, file("scene.json", _read_scene), 3000),
     Reader("scene-elsewhere", ".json", _scenes, file("scene.json", _read_elsewhere), 3000),
     Reader("provenance", ".json", _provenance, file("provenance/train.json", _read_provenance), 1000),
     Reader("provenance-shown", ".json", _provenance, file("provenance/scene.json", _read_shown), 1000),
     Reader("cap", ".json", _caps, file("cap.json", _read_cap), 3000),
-    Reader("options", ".json", _noted(OPTIONS),
+    Reader("options", ".json", noted(OPTIONS),
            file("segmented/options.json", lambda p: recorded_settings(RunDir(p.parents[1]))), 3000),
     Reader("manifest", ".json", _manifest, file("manifest.json", _read_manifest)),
     Reader("begun", ".npz", checkpoints, file("checkpoint.npz", _read_begun)),
-    Reader("segmented", ".json", _of(lambda n: {str(i): f"thing {i}" for i in range(n)}),
+    Reader("segmented", ".json", documents(lambda n: {str(i): f"thing {i}" for i in range(n)}),
            file(".taxonomy.json", lambda p: segmenters._begin(p.parent, Taxonomy({0: "thing 0"}), [])), 1000),
     Reader("photo-hashes", ".json", _hashes, file("photos.json", _read_hashes), 1000),
-    Reader("frozen", ".json", _of(lambda n: {str(label): 500 for label in range(2 * n)}),
+    Reader("frozen", ".json", documents(lambda n: {str(label): 500 for label in range(2 * n)}),
            file("frozen.json", read_frozen), 3000),
-    Reader("edits", ".json", _of(lambda n: {"table": [0, 7, -1, *range(n)], "labels": {"7": "sky"}}),
+    Reader("edits", ".json", documents(lambda n: {"table": [0, 7, -1, *range(n)], "labels": {"7": "sky"}}),
            file("edit.json", lambda p: label.read_edit_table(p, Taxonomy({0: "sky", 2: "tree"}))), 10_000),
     Reader("label-edits", ".json", _label_edits, file("labels.edit.json", label_edits.read_edits), 1000),
     Reader("parents", ".json",
-           _written("p.json", lambda p, n: write_parents(p, {f"chair {i}": "chair" for i in range(n)})),
+           written_by("p.json", lambda p, n: write_parents(p, {f"chair {i}": "chair" for i in range(n)})),
            file("parents.json", read_parents), 3000),
-    Reader("edited", ".json", _written("edited.json", _write_edited),
+    Reader("edited", ".json", written_by("edited.json", _write_edited),
            file("edited.json", lambda p: label_settings(RunDir(p.parent))), 3000),
-    Reader("segmenting", ".json", _noted(NETWORK),
+    Reader("segmenting", ".json", noted(NETWORK),
            file(".network.json", lambda p: label._is(p, NETWORK)), 3000),
     Reader("prompts", ".json",
-           _of(lambda n: {"best": {f"prompt {i}": 0.5 for i in range(n)}, "threshold": 0.3},
+           documents(lambda n: {"best": {f"prompt {i}": 0.5 for i in range(n)}, "threshold": 0.3},
                lambda n: {"best": []}),
            file(".prompts-0.json", read_scores), 3000),
     Reader("live", ".json",
-           _of(lambda n: {"of": {"level": "1.npz", "written": 9}, "kept": [["chunks/a.spz"] * n]}),
+           documents(lambda n: {"of": {"level": "1.npz", "written": 9}, "kept": [["chunks/a.spz"] * n]}),
            file("live.json", live_bundle.read_live), 3000),
     Reader("lock", ".json",
-           _of(lambda n: {"pid": 9, "host": "h", "command": "sagesplat run" * n, "since": "2026"}),
+           documents(lambda n: {"pid": 9, "host": "h", "command": "sagesplat run" * n, "since": "2026"}),
            file("lock", lock._holder), 3000),
 )  # fmt: skip
