@@ -223,12 +223,7 @@ def test_harmonics_of_zero_stay_zero_and_cost_nothing(sh_bits):
     without = replace(g, shN=torch.zeros_like(g.shN))
     content = encode_spz(without, sh_bits=sh_bits)
     assert (decode_spz(content).shN == 0).all()
-    assert len(content) - len(encode_spz(without, sh_degree=0)) < 2000 * 45 / 200
-
-
-def test_a_lower_degree_drops_harmonics():
-    g = random_gaussians(20, degree=2)
-    assert [decode_spz(encode_spz(g, sh_degree=d)).sh_degree for d in range(4)] == [0, 1, 2, 2]
+    assert len(content) - len(encode_spz(replace(g, shN=g.shN[:, :0]))) < 2000 * 45 / 200
 
 
 def test_positions_take_the_bits_that_fit():

@@ -26,7 +26,7 @@ from jaxtyping import Int64
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import morton_order
-from sagesplat.core.sh import BASES, bases
+from sagesplat.core.sh import bases
 from sagesplat.formats.labels import as_json, labelled
 from sagesplat.formats.quantisation import (
     COLOUR_STEP,
@@ -88,7 +88,6 @@ def write_spz(
 def encode_spz(
     g: Gaussians,
     *,
-    sh_degree: int | None = None,
     antialiased: bool = False,
     fractional_bits: int | None = None,
     sh_bits: tuple[int, int] = SH_BITS,
@@ -107,7 +106,6 @@ def encode_spz(
 
     Args:
         g: The Gaussians, on any device.
-        sh_degree: Harmonics up to this degree are written; None: all there are.
         antialiased: How the scene was trained; a flag for viewers.
         fractional_bits: Positions are rounded to 2^-bits world units. None: to at most an eighth of the size
             of nine in ten Gaussians, or what the extent allows.
@@ -143,9 +141,7 @@ def encode_spz(
     if len(g) > MAX_COUNT:
         raise DataError(f"{name}: {len(g)} Gaussians; SPZ readers take {MAX_COUNT}, write several files")
     check_writable(g, name)
-    degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
-    means, quats, harmonics = g.means.numpy(), g.quats.numpy(), g.shN[:, : BASES[degree]].numpy()
-    means, quats, harmonics = flipped(means, quats, harmonics, frame)
+    means, quats, harmonics = flipped(g.means.numpy(), g.quats.numpy(), g.shN.numpy(), frame)
     bits = _fractional_bits(name, means, g.log_scales.numpy(), fractional_bits, coarse)
     opacity_step, colour_step, scale_step, rotation_step = _COARSE if coarse else (1, 1, 1, 1)
     fixed = np.rint(means.astype(np.float64) * 2.0**bits).astype("<i4")
@@ -159,11 +155,11 @@ def encode_spz(
     ]
     flags = ANTIALIASED if antialiased else 0
     if version == 3:
-        return gzipped(len(g), degree, bits, flags, attributes)
+        return gzipped(len(g), g.sh_degree, bits, flags, attributes)
     records = {} if names is None else {_LABELS: as_json(g.label_ids, names, parents or {})}
     if frame != "rub":
         records[_AXES] = _FRAMES.index(frame, 1).to_bytes(4, "little")
-    return zstd_packed(len(g), degree, bits, flags, attributes, records)
+    return zstd_packed(len(g), g.sh_degree, bits, flags, attributes, records)
 
 
 def packing_order(g: Gaussians) -> Int64[np.ndarray, " N"]:
