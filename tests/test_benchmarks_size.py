@@ -7,16 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.size_tables import (
-    AS_ONE,
-    OUTSIDE,
-    SURVEY,
-    TRAINED,
-    Measured,
-    ratio,
-    summary,
-    write_survey,
-)
+from benchmarks.size_tables import AS_ONE, OUTSIDE, SURVEY, TRAINED, Measured, ratio, summary, write_survey
 from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point
 
 
@@ -27,10 +18,7 @@ def point(method: str, name: str, encoded: int, ssim: float, psnr: float = 25.0)
 
 OURS = [point(SAME_SHARE, f"level {k}", 1000 * 10**k, ssim, 20 + k) for k, ssim in enumerate((0.5, 0.7, 0.9))]
 PLANS = [replace(p, method=PLANNED, encoded=p.encoded // 10 * 9) for p in OURS]
-FIGURES = {
-    "encoding_s_per_100k": 1.5,
-    "trained_gaussians": 10_000,
-}
+FIGURES = {"encoding_s_per_100k": 1.5, "trained_gaussians": 10_000}
 
 
 def measured(*more: Point) -> Measured:

@@ -108,10 +108,7 @@ def test_a_level_that_cannot_replace_is_refused(tmp_path, levels):
         read_prefixes(tmp_path / "ladder.npz")
 
 
-@pytest.mark.parametrize(
-    "values",
-    [np.array([2.0]), np.array(2), np.full(9, 2), np.array([2, -1])],
-)
+@pytest.mark.parametrize("values", [np.array([2.0]), np.array(2), np.full(9, 2), np.array([2, -1])])
 @pytest.mark.parametrize("array", ["replaces", "sizes"])
 def test_damaged_sizes_and_replacing_levels_are_one_line(tmp_path, array, values):
     g = replace(random_gaussians(9), label_ids=torch.zeros(9, dtype=torch.int16))

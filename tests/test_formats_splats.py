@@ -15,15 +15,7 @@ from sagesplat.formats.ply import write_ply
 from sagesplat.formats.splat import OPAQUE
 from sagesplat.formats.splats import num_lods, read_splat
 from sagesplat.formats.spz import encode_spz, write_spz
-from tests.fuzz.readers.foreign_splats import (
-    archived,
-    compressed_ply,
-    dotsplat,
-    put_sog,
-    sog,
-    streamed,
-    webp,
-)
+from tests.fuzz.readers.foreign_splats import archived, compressed_ply, dotsplat, put_sog, sog, streamed, webp
 from tests.fuzz.readers.making import splats
 from tests.test_formats_ply import columns_of, foreign, make, same
 

@@ -11,17 +11,7 @@ import pytest
 from benchmarks.common import RESULTS
 from benchmarks.scaling import __main__ as report
 from benchmarks.scaling import figures, theory
-from benchmarks.scaling.cdn import (
-    DAY,
-    HIT,
-    MISS,
-    VALIDATED,
-    Outcome,
-    Site,
-    new_caches,
-    serve,
-    simulate,
-)
+from benchmarks.scaling.cdn import DAY, HIT, MISS, VALIDATED, Outcome, Site, new_caches, serve, simulate
 from benchmarks.scaling.visits import KINDS, Library, read
 from sagesplat.core.errors import DataError
 

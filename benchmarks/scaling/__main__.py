@@ -65,10 +65,7 @@ def run(visits: Path, out: Path, viewers: Sequence[int], seed: int) -> dict[str,
     result: dict[str, Any] = origin() | {"site": asdict(base), "bundles": list(small.names)}
     result["visits"] = {name: means(library) for name, library in named.items()}
     result["days"] = days(small, base, viewers)
-    result["caches"] = {
-        "as recorded": sweep(small, middle),
-        "ten times the bytes": sweep(large, middle),
-    }
+    result["caches"] = {"as recorded": sweep(small, middle), "ten times the bytes": sweep(large, middle)}
     result["variants"] = variants(small, files, middle)
     write_json(out / "scaling.json", result)
     with (out / "scaling-days.csv").open("w", newline="", encoding="utf-8") as file:
@@ -76,10 +73,7 @@ def run(visits: Path, out: Path, viewers: Sequence[int], seed: int) -> dict[str,
         writer.writeheader()
         writer.writerows(result["days"])
     shown = {"as recorded (92 k Gaussians)": small, "ten times the bytes": large}
-    drawn = {
-        "visits": figures.visits(shown),
-        "hits": figures.hits(result["days"], result["caches"]),
-    }
+    drawn = {"visits": figures.visits(shown), "hits": figures.hits(result["days"], result["caches"])}
     for name, figure in drawn.items():
         figure.savefig(out / f"scaling-{name}.png", dpi=110)
     return result
