@@ -62,12 +62,6 @@ def test_brackets_and_codes_are_kept(kind: str, text: str) -> None:
     assert text in printed(events_of(text)[kind])
 
 
-def test_a_path_is_printed_whole() -> None:
-    shown = printed(RunDone(Path("/runs/[old]/caf\udce9/report"), ("view", "/runs/[/red]")))
-    assert "/runs/[old]/caf\\xe9/report" in shown
-    assert "view '/runs/[/red]'\n" in shown  # as a shell takes it
-
-
 def test_a_run_ends_in_three_lines_with_the_next_command() -> None:
     done = RunDone(
         Path("/runs/a b/report/index.html"), ("view", "/runs/a b"), outcome="0.46 MB of 0.91 MB; SSIM 0.8"

@@ -10,8 +10,6 @@ from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
 from sagesplat.core.errors import DataError
 from sagesplat.formats.increments import read_increments, read_index, shown, totals, write_increments
 from sagesplat.formats.levels import write_set
-from sagesplat.formats.ply import read_ply, write_ply
-from sagesplat.formats.splats import read_splat
 
 
 def test_increments_of_long_and_like_names_are_files_of_their_own(tmp_path):
@@ -30,12 +28,6 @@ def test_increments_of_long_and_like_names_are_files_of_their_own(tmp_path):
     }
 
 
-def test_a_ply_of_any_names_reads_back(tmp_path):
-    g = random_gaussians(3)
-    write_ply(tmp_path / "a.ply", g, {-1: "a\nend_header", 3: "\ud800", 184: "日" * 5000})
-    assert len(read_ply(tmp_path / "a.ply")) == 3
-
-
 SIZES = {0: (2, 5, 9, 20), 1: (3, 3, 8, 8), 2: (4, 8, 12, 16)}
 REPLACES = {0: (3,), 2: (2, 4)}
 
@@ -45,17 +37,6 @@ def ladder_of_replacing_levels(folder: Path) -> PrefixLadder:
     g = replace(random_gaussians(44), label_ids=torch.tensor([0] * 20 + [1] * 8 + [2] * 16).short())
     write_set(folder / "ladder.npz", g, 1, SIZES, replaces=REPLACES, exact=True)
     return read_prefixes(folder / "ladder.npz")
-
-
-@pytest.mark.parametrize("kind", ["ply", "spz"])
-def test_files_say_how_they_were_trained(tmp_path, kind):
-    g = random_gaussians(4, degree=0)
-    g = replace(g, label_ids=torch.zeros(4, dtype=torch.int16))
-    for antialiased in (True, False):
-        listed = write_increments(
-            tmp_path / "out", g, {0: (4,)}, {0: "a"}, kind=kind, antialiased=antialiased
-        )
-        assert read_splat(tmp_path / "out" / listed[0].uri).antialiased is antialiased
 
 
 def test_a_level_may_replace_those_below(tmp_path):

@@ -57,12 +57,6 @@ def test_an_exact_level_is_identical_bit_for_bit(tmp_path, degree):
     assert (tmp_path / "set.npz").stat().st_size < len(g) * (14 + 3 * g.shN.shape[1]) * 4 + 12_000
 
 
-def test_harmonics_not_yet_in_use_are_left_out(tmp_path):
-    path = write_level(tmp_path, 5, random_gaussians(30), recovering=False, sh_degree=1)
-    assert read_level(path).shN.shape == (30, 3, 3)
-    assert read_header(path).sh_degree == 1
-
-
 def test_header_and_single_categories(tmp_path):
     g = random_gaussians(100)
     path = write_level(tmp_path, 42, g, recovering=True, sh_degree=3)

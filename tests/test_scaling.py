@@ -107,11 +107,6 @@ def test_simulation_and_closed_form_agree(library: Library):
     assert day.row()["pop_hits_bytes"] == pytest.approx(theory.pop_hits(library, site)[1], abs=0.03)
 
 
-@pytest.mark.parametrize("change", [{"edge_ttl": 60.0}, {"shared_viewer": True}, {"returning": 0.6}])
-def test_what_saves_requests_to_the_origin(library: Library, day: Outcome, change: dict[str, float]):
-    assert simulate(library, replace(SITE, **change)).origin < day.origin  # pyright: ignore[reportArgumentType]
-
-
 def test_recorded_visits_are_read(library: Library):
     assert library.names == ("tiny", "tiny")
     assert (library.visits, library.profiles) == (4, ("everything", "target 0.8"))

@@ -495,19 +495,12 @@ def test_in_the_pack_what_the_first_view_skips_comes_last() -> None:
     assert sorted(order) == [(i, k) for i in (0, 1) for k in (1, 2, 3, 4)]
 
 
-FRONT, BEHIND = np.array([[-1.0, -1, -6, 1, 1, -4]]), np.array([[-1.0, -1, 4, 1, 1, 6]])
+FRONT = np.array([[-1.0, -1, -6, 1, 1, -4]])
 
 
 def order_at_origin(*ladders: Ladder) -> list[tuple[int, int]]:
     """Of the view along -z from the origin."""
     return order_of(ladders, [camera()], np.zeros(3), np.array([0.0, 0, 0, 1]))
-
-
-def test_what_is_in_sight_comes_first_in_the_pack() -> None:
-    behind, front = Ladder([10, 10], 1.0, BEHIND, None, None), Ladder([50, 50], 1.0, FRONT, None, None)
-    assert order_at_origin(behind, front) == [(1, 1), (0, 1), (1, 2), (0, 2)]
-    nowhere = replace(behind, boxes=np.zeros((0, 6)))  # may be anywhere
-    assert order_at_origin(behind, nowhere)[0] == (1, 1)
 
 
 def test_what_gains_more_a_byte_comes_first_in_the_pack() -> None:
