@@ -8,6 +8,8 @@ import pytest
 import torch
 
 import sagesplat
+from sagesplat.cli import stages, tools
+from sagesplat.cli.help import help_of
 from sagesplat.core.errors import DataError
 from sagesplat.formats.registry import READERS, WRITERS
 from sagesplat.formats.splat import SplatReader, SplatWriter
@@ -98,3 +100,13 @@ def test_every_file_with_a_reader_or_writer_is_registered():
     modules = [__import__(f"sagesplat.formats.{path.stem}", fromlist=["x"]) for path in folder.glob("*.py")]
     found = [v for m in modules for v in vars(m).values() if isinstance(v, SplatReader | SplatWriter)]
     assert {id(one) for one in found} == {id(one) for one in registered}
+
+
+def test_help_and_documents_name_the_registered_formats():
+    page = (ROOT / "docs/formats.md").read_text()
+    for text in (help_of("adopt", stages.adopt), page):
+        assert [kind for kind in READERS if kind not in " ".join(text.split())] == []
+    for text in (help_of("export", tools.export), page):
+        assert [name for name in WRITERS if name not in text] == []
+    clean = help_of("clean", stages.clean)
+    assert [name for name, writer in WRITERS.items() if writer.write and name not in clean] == []
