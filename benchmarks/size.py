@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import tyro
 
-from benchmarks import far
 from benchmarks.common import finish
 from benchmarks.promises import CASES
 from benchmarks.size_tables import AS_ONE, TRAINED, Measured, summary, table, write_survey
@@ -99,8 +98,6 @@ class Asked:
     """Sizes of 3DGS-MCMC."""
     plan_views: int = 80
     """Viewpoints at which levels are measured for plans within budgets."""
-    far_views: int = 12
-    """Viewpoints that bytes from far away are measured at; 0: none."""
     lpips: Path | None = None
     """Folder with the LPIPS weights."""
     vgg: bool = False
@@ -305,9 +302,6 @@ def _figures(
         "encoding_s_per_100k": took * 1e5 / len(full),  # and reading it back
         "ssim_lost_by_encoding": unencoded.ssim - encoded.ssim,
         "psnr_lost_by_encoding": unencoded.psnr - encoded.psnr,
-        "resolutions": far.at_resolutions(job, {"full": full})["full"],
-        "farther": far.from_farther(job, {"full": full}, full)["full"],
-        "bytes_from_far": far.bytes_needed(job, asked.far_views) if asked.far_views else {},
     }
 
 
@@ -319,7 +313,7 @@ def main(
     survey: bool = False,
     write: bool = False,
 ) -> None:
-    """Bytes at equal SSIM beside sets made for one size, what nesting costs, and levels from far away.
+    """Bytes at equal SSIM beside sets made for one size, and what nesting costs.
 
     Args:
         folder: where runs are made; what is done already is skipped.

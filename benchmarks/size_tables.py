@@ -66,7 +66,6 @@ def summary(measured: Measured) -> dict[str, Any]:
         "bytes_ratio": ratios,  # of plans within a budget
         "bytes_ratio_same_share": same_share,
         "worst_ratio": {name: _worst(rows) for name, rows in ratios.items() if rows},
-        "far_bytes_ratio": _far(figures["bytes_from_far"]),
         "bars": bars(full, as_one, ratios, figures),
     }
 
@@ -87,10 +86,8 @@ def _worst(rows: Mapping[str, Mapping[str, Any]]) -> float | None:
 
 def bars(
     full: Point, as_one: Point, ratios: Mapping[str, Mapping[str, Any]], figures: Mapping[str, Any]
-) -> dict[str, bool | None]:
-    """Whether each bar is met; None: not measured."""
-    by_resolution = {int(times): of["ssim"] for times, of in figures["resolutions"].items()}
-    far = _far(figures["bytes_from_far"]).get("resolution", {})
+) -> dict[str, bool]:
+    """Whether each bar is met."""
     worst = {name: _worst(rows) for name, rows in ratios.items() if rows}
     return {
         "top within 0.1 dB of as one": full.psnr >= as_one.psnr - 0.1,
@@ -98,22 +95,11 @@ def bars(
         **{f"0.6 of the bytes of {n}": _most(worst[n], 0.6) for n in (SNAPSHOTS,) if n in worst},
         "12 bytes a Gaussian": full.encoded / figures["trained_gaussians"] <= 12,
         "100 k encoded in 20 s": figures["encoding_s_per_100k"] <= 20,
-        "SSIM at 1/4 at least that at 1/1": by_resolution[4] >= by_resolution[1],
-        "0.6 of the bytes at 1/4": max(far.values()) <= 0.6 if far else None,
     }
 
 
 def _most(value: float | None, bar: float) -> bool:
     return value is not None and value <= bar
-
-
-def _far(needed: Mapping[str, Mapping[int, Mapping[float, float]]]) -> dict[str, dict[str, float]]:
-    """Bytes from farthest over those from near, by what makes it far and by target."""
-    found: dict[str, dict[str, float]] = {}
-    for name, of in needed.items():
-        near, away = of[min(of)], of[max(of)]
-        found[name] = {f"{target:g}": away[target] / near[target] for target in near}
-    return found
 
 
 def _quality(point: Point) -> dict[str, float | None]:

@@ -150,10 +150,7 @@ def figure(curves: Path, out: Path) -> None:
                 axes.step(time, ssim, line, where="post", color=color, lw=width, label=title)
                 end = max(end, *time) if way != "file order" else end
             axes.set(
-                title=f"{link:g} Mbit/s",
-                xlabel="seconds after the page",
-                xlim=(0, 1.2 * end),
-                ylim=(0, 1.03),
+                title=f"{link:g} Mbit/s", xlabel="seconds after the page", xlim=(0, 1.2 * end), ylim=(0, 1.03)
             )
         picture.axes[0].set_ylabel("expected fidelity")
         picture.legend(

@@ -1,6 +1,6 @@
 """Small labelled Gaussians, cameras and a capture on disk that several tests share."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -205,6 +205,28 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_json(masks / "labels.json", {"labels": {"3": "car", "184": "tree-merged"}})
     run_all(Job(RunDir(folder / "run"), lambda event: None, "cpu"), folder / "capture", SMALL_RUN)
     return folder / "run"
+
+
+Call = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
+    """A command as typed: its exit code, and what it prints."""
+
+    def typed(*words: str | Path) -> tuple[int, str]:
+        from sagesplat import cli
+
+        monkeypatch.setattr("sys.argv", ["sagesplat", *map(str, words)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out = capsys.readouterr()
+        return code, out.out + out.err
+
+    return typed
 
 
 @dataclass(frozen=True)

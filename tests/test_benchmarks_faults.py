@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import faults, faults_run
-from benchmarks.faults import tables
-from benchmarks.faults_run import AGAIN, Asked, Command, Outcome, differing, digests, ends, stages
-from sagesplat.core.errors import RunError
+from benchmarks import faults_run
+from benchmarks.faults_run import AGAIN, Asked, Command, differing, digests, ends, stages
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills and mounts are POSIX only")
 SAID = """✓ scene        0.5 s  46 training, 8 test views
@@ -73,24 +71,6 @@ def test_what_a_run_prints_is_understood() -> None:
     ]
 
 
-def test_the_tables_say_what_was_lost_and_what_differs() -> None:
-    local = Outcome("1 thread", seconds=10.0, stages={"train": 5.5, "block 0/train": 2.0, "lift": 0.1})
-    spread = Outcome("3 nodes", seconds=8.0, stages={"train": 2.75, "lift": 0.1})
-    lost = Outcome("node killed, 1 of 3", "3 nodes", ["a node"], 1, 9.0, ["block 1"], differing=["a", "b"])
-    cases, speed = tables("demo", {found.case: found for found in (local, spread, lost)})
-    assert cases.cells() == [
-        ["1 thread", "0", "10", "–", "0", "same"],
-        ["3 nodes", "0", "8", "–", "0", "same"],
-        ["node killed, 1 of 3", "1", "9", "1", "1", "no: a, b"],
-    ]
-    assert speed.cells() == [["train", "5.5", "2.8", "2.00"], ["all", "10.0", "8.0", "1.25"]]
-
-
-def test_a_case_needs_the_undisturbed_run(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"faults\.json: no case '1 thread' yet; run cases a and b first$"):
-        faults.measure(Asked(tmp_path, tmp_path / "out", ()), ("e",), print)
-
-
 def program(folder: Path, monkeypatch: pytest.MonkeyPatch, does: str) -> Asked:
     """A program in the place of sagesplat."""
     script = folder / "program"
@@ -98,14 +78,6 @@ def program(folder: Path, monkeypatch: pytest.MonkeyPatch, does: str) -> Asked:
     script.chmod(0o755)
     monkeypatch.setattr(faults_run, "PROGRAM", (str(script),))
     return Asked(folder / "scene", folder / "out", ("--downscale=4",))
-
-
-def test_a_command_that_fails_is_a_problem(tmp_path: Path, monkeypatch) -> None:
-    asked = program(tmp_path, monkeypatch, 'echo "sagesplat: $*" >&2; exit 2')
-    found = faults.undisturbed(asked, 1)
-    words = f"run {asked.scene} {asked.run} --downscale=4 --threads=1"
-    assert found.problems == [f"exit code 2: sagesplat: {words}"]
-    assert found.result == found.problems[0]
 
 
 def test_a_command_is_killed(tmp_path: Path, monkeypatch) -> None:

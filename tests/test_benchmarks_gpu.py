@@ -2,11 +2,9 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gsplat
-import gsplat_standin
 import numpy as np
 import pytest
 import torch
@@ -65,50 +63,6 @@ def test_a_machine_without_a_gpu_says_so_in_one_line(capsys):
     assert "; " in line or " or use --device cpu" in line
 
 
-def test_a_check_that_fails_does_not_keep_others_from_running(tmp_path, monkeypatch, capsys):
-    def broken(bench: base.Bench) -> base.Outcome:
-        raise RuntimeError("first line\nsecond line")
-
-    def fine(bench: base.Bench) -> base.Outcome:
-        return base.Outcome("ok", "well")
-
-    monkeypatch.setattr(script, "CHECKS", {"one": broken, "two": fine})
-    write_capture(tmp_path / "capture", random_gaussians(40))
-    assert script.check(base.Asked(tmp_path / "capture", device="cpu", out=tmp_path / "out")) == 1
-    printed = capsys.readouterr().out
-    assert printed.splitlines()[-2:] == [
-        "one        FAILED   RuntimeError: first line",
-        "two        ok       well",
-    ]
-    assert "no categories: " in printed
-    assert script.check(base.Asked(tmp_path / "capture", device="cpu", only=("three",))) == 2
-
-
-def test_a_lost_device_leaves_the_rest_to_a_new_process(tmp_path, monkeypatch):
-    commands = []
-
-    def run(command, **options):
-        commands.append(command)
-        (tmp_path / "two.json").write_text(json.dumps({"state": "ok", "line": "well"}))
-
-    monkeypatch.setattr(script.subprocess, "run", run)
-    asked = base.Asked(Path("scene"), minutes=5.0, out=tmp_path, write=True, masks=Path("labels"))
-    bench = SimpleNamespace(asked=asked, left=lambda: 120.0)
-    found = script.anew(bench, ["two", "three"])  # type: ignore[arg-type]
-    assert found["two"] == base.Outcome("ok", "well")
-    assert found["three"].state == "FAILED"
-    (command,) = commands
-    assert command[1:5] == ["-m", "benchmarks.gpu", "--scene", "scene"]
-    assert command[command.index("--only") :] == ["--only", "two", "three"]
-    assert command[command.index("--minutes") + 1] == "1.5"
-    assert "--write" in command
-
-
-def test_names_of_folders():
-    assert script.slug("NVIDIA H200") == "nvidia-h200"
-    assert script.slug("NVIDIA RTX A6000 (2)") == "nvidia-rtx-a6000-2"
-
-
 def test_targets_are_what_so_many_labels_have_reached():
     reached = {1: 0.9019, 2: 0.8, 3: 0.7, 4: 0.6, 5: 0.5, 6: 0.4007}
     found = runs.targets(reached)
@@ -116,50 +70,6 @@ def test_targets_are_what_so_many_labels_have_reached():
     for name, share in (("third", 2), ("two_thirds", 4), ("all", 6)):
         assert sum(ssim >= found[name] for ssim in reached.values()) == share
     assert runs.targets({1: 0.75}) == {"third": 0.75, "two_thirds": 0.75, "all": 0.75}
-
-
-def test_time_to_an_ssim_is_on_straight_lines():
-    curve = [(10.0, 0.5), (20.0, 0.7), (30.0, 0.6), (40.0, 0.8)]
-    assert runs.time_to(curve, 0.4) == 10
-    assert runs.time_to(curve, 0.6) == pytest.approx(15)
-    assert runs.time_to(curve, 0.7) == 20
-    assert runs.time_to(curve, 0.75) == pytest.approx(37.5)
-    assert runs.time_to(curve, 0.81) is None
-    assert runs.time_to([], 0.5) is None
-
-
-def test_steps_that_there_is_time_for():
-    assert runs.affordable(30_000, 1000, 1.0, 2) == 30_000
-    assert runs.affordable(30_000, 100, 2.0, 4.3) == 11_600
-    assert runs.affordable(30_000, -5, 2.0, 4.3) == 300
-    assert runs.affordable(60, -5, 2.0, 4.3) == 60
-
-
-def test_kernels_belong_to_parts_of_a_step():
-    names = {
-        "void gsplat::projection_ewa_3dgs_fused_bwd_kernel<float>(...)": "projection",
-        "void gsplat::spherical_harmonics_fwd_kernel<float>": "projection",
-        "void gsplat::intersect_tile_kernel<float>": "tiles and sort",
-        "void cub::DeviceRadixSortOnesweepKernel<...>": "tiles and sort",
-        "void gsplat::rasterize_to_pixels_3dgs_fwd_kernel<3u, float>": "raster forward",
-        "void gsplat::rasterize_to_pixels_3dgs_bwd_kernel<3u, float>": "raster backward",
-        "_blur_images_across": "ssim",
-        "_compare": "ssim",
-        "_gradient": "ssim",
-        "_update": "adam",
-        "void at::native::vectorized_elementwise_kernel<4, ...>": "rest",
-    }
-    assert {name: split.group_of(name) for name in names} == names
-    assert set(split.traffic(10, 20, 30, 16)) == {name for name, _ in split.KERNELS}
-
-
-def test_binning_is_timed_over_the_cuda_backend(tmp_path, monkeypatch):
-    gsplat_standin.install(monkeypatch)
-    scene = write_capture(tmp_path / "capture", random_gaussians(20))
-    bench = SimpleNamespace(scene=scene, device=torch.device("cpu"))
-    found = split.binning(bench, random_gaussians(20))  # type: ignore[arg-type]
-    assert found["intersections"] > 20
-    assert found["host_ms"] > 0
 
 
 # --- gsplat's recipe -------------------------------------------------------------------------------------

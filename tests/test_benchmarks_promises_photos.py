@@ -5,7 +5,7 @@ import json
 import numpy as np
 from viewpoint_fields import LEVELS, orbit, synthetic
 
-from benchmarks.promises_photos import _split, lines, redrawn, summary
+from benchmarks.promises_photos import _split, redrawn, summary
 
 SCENE = orbit(96)
 COSTS = {(5, level): level for level in LEVELS}
@@ -25,19 +25,6 @@ def test_redraws_of_a_known_field():
     )
     assert row["coverage_p5"] <= row["coverage"] <= 1
     assert row["covered"] == (row["coverage"] >= 0.95 and row["coverage_p5"] >= 0.88)
-
-
-def test_what_was_found_is_told():
-    found = summary(redrawn(synthetic(SCENE, 1), SCENE, COSTS, [0.5, 0.6], 2))
-    said = lines("a scene", {"calibration_views": 18, "test_views": 24, **found})
-    assert len(said) == 3
-    assert all(0 < len(line) <= 110 for line in said)
-
-
-def test_nothing_to_draw():
-    none = synthetic(SCENE, 1)
-    empty = redrawn(none.select(none.label_id < 0), SCENE, COSTS, [0.5], 2)
-    assert summary(empty) == {"targets": {}, "covered": True, "tight": True}
 
 
 def test_a_split_keeps_the_training_views():

@@ -61,10 +61,3 @@ def test_before_and_after_is_a_table_and_one_line_of_json(checkout, tmp_path, ca
     assert lines[0] == "|  | before | after |"
     assert "| lines of source | 22 | 22 |" in lines
     assert json.loads(lines[-1])["after"]["circles of folders"] == ["a b c"]
-
-
-def test_what_is_no_checkout_is_one_line(tmp_path):
-    for against in ("", "none"):
-        with pytest.raises(SystemExit, match="name") as caught:
-            structure.main(tmp_path, against=against)
-        assert "\n" not in str(caught.value)

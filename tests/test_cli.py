@@ -2,28 +2,17 @@
 
 import os
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from conftest import random_gaussians, write_capture
+from conftest import Call, random_gaussians, write_capture
 
 from sagesplat import cli
 from sagesplat.cli import help
 from sagesplat.cli.overview import summaries
 from sagesplat.core.names import visible
-
-
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
-    """Exit code and standard error of a command."""
-    monkeypatch.setattr(sys, "argv", ["sagesplat", *words])
-    try:
-        cli.main()
-    except SystemExit as end:
-        return int(end.code or 0), capsys.readouterr().err
-    return 0, capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("given", "found"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
@@ -43,22 +32,15 @@ def test_idle_threads_sleep_unless_the_environment_says_otherwise(given: str | N
     [
         (["fly"], "no command 'fly'; there are info, run"),
         (["info", "nowhere"], "nowhere: "),
-        (["run", "nowhere", "out"], "nowhere: "),
-        (["train", "nowhere"], "not a run folder"),
         (["plan", "nowhere", "--target-ssim", "0.5"], "not a run folder"),
-        (["report", "nowhere"], "not a run folder"),
         (["run", ".", "out", "--device", "cuda"], "use --device cpu"),
     ],
 )
 def test_a_users_mistake_is_one_line(
-    words: list[str],
-    says: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    words: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, error = call(monkeypatch, capsys, *words)
+    code, error = command(*words)
     assert code == 2
     assert error.startswith("sagesplat: ")
     assert error.count("\n") == 1
@@ -67,7 +49,7 @@ def test_a_users_mistake_is_one_line(
 
 
 def test_ctrl_c_and_a_full_disk_are_one_line_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
 ) -> None:
     from sagesplat import scene
 
@@ -80,14 +62,12 @@ def test_ctrl_c_and_a_full_disk_are_one_line_too(
             raise error
 
         monkeypatch.setattr(scene, "load_scene", fail)
-        code, line = call(monkeypatch, capsys, "info", str(tmp_path))
+        code, line = command("info", str(tmp_path))
         assert code == 2
         assert says in line
 
 
-def test_flags_reach_their_settings(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_flags_reach_their_settings(monkeypatch: pytest.MonkeyPatch, command: Call) -> None:
     from sagesplat.stages import pipeline
 
     seen = {}
@@ -95,7 +75,7 @@ def test_flags_reach_their_settings(
     words = (
         "run a b --downscale 2 --target-ssim 0.7 --train.max-steps 70 --segmenter onnx --seed 3 --threads 1"
     )
-    assert call(monkeypatch, capsys, *words.split())[0] == 0
+    assert command(*words.split())[0] == 0
     config = seen["config"]
     assert (config.scene.downscale, config.plan.target_ssim, config.train.max_steps) == (2, 0.7, 70)
     assert (config.masks.segmenter, config.seed, seen["job"].threads) == ("onnx", 3, 1)
@@ -116,14 +96,14 @@ def test_flags_reach_their_settings(
     ],
 )
 def test_targets_of_both_qualities(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: str, targets: list
+    monkeypatch: pytest.MonkeyPatch, words: str, targets: list, command: Call
 ) -> None:
     from sagesplat.stages import pipeline
     from sagesplat.stages.plan import check_targets
 
     seen = {}
     monkeypatch.setattr(pipeline, "run_all", lambda job, scene, config: seen.update(config=config))
-    assert call(monkeypatch, capsys, "run", "a", "b", *words.split())[0] == 0
+    assert command("run", "a", "b", *words.split())[0] == 0
     config = check_targets(seen["config"].plan, seen["config"].ladder)
     assert config.all_targets == targets
     assert (config.quality, config.target) in config.all_targets
@@ -134,16 +114,11 @@ def test_targets_of_both_qualities(
                                    "--target-fidelity 0.9 --other-targets 0.5 2",
                                    "--ladder snapshots --target-fidelity 0.9"])  # fmt: skip
 def test_impossible_targets_are_one_line_before_anything_is_read(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, words: str
+    tmp_path: Path, words: str, command: Call
 ) -> None:
-    code, line = call(monkeypatch, capsys, "run", str(tmp_path), str(tmp_path / "run"), *words.split())
+    code, line = command("run", str(tmp_path), str(tmp_path / "run"), *words.split())
     assert code == 2
     assert re.search("target.* is impossible; choose|needs the nested ladder; give", line)
-
-
-def test_help_imports_no_torch() -> None:
-    code = "import sys; from sagesplat.cli import commands; commands(); sys.exit('numpy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_the_overview_loads_no_command() -> None:
@@ -214,20 +189,6 @@ def test_every_argument_of_every_command_has_help() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "absent"),
-    [
-        ("plan", ["--processes", "--memory-limit", "--executor", "--device", "--threads"]),
-        ("bundle", ["--processes", "--memory-limit", "--executor", "--force"]),
-        ("compose", ["--processes", "--memory-limit", "--executor"]),
-        ("lift", ["--processes", "--device"]),
-    ],
-)
-def test_a_command_has_the_flags_that_it_uses(command: str, absent: list[str]) -> None:
-    names = {flag.name for flag in help.flags_of(cli.commands()[command])}
-    assert not names & set(absent)
-
-
-@pytest.mark.parametrize(
     ("words", "says"),
     [
         (["run", "a"], "Missing from sagesplat run: RUN"),
@@ -243,51 +204,23 @@ def test_a_command_has_the_flags_that_it_uses(command: str, absent: list[str]) -
         (["export", "a", "b", "--level"], "Missing value for argument '--level'"),
     ],
 )
-def test_words_that_cannot_be_parsed_are_one_line(
-    words: list[str], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, error = call(monkeypatch, capsys, *words)
+def test_words_that_cannot_be_parsed_are_one_line(words: list[str], says: str, command: Call) -> None:
+    code, error = command(*words)
     assert code == 2
     assert error.startswith(f"sagesplat: {says}")
     assert error.endswith(f"see `sagesplat {words[0]} --help`\n")
     assert error.count("\n") == 1
 
 
-def test_demo_has_a_folder_of_its_own(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from sagesplat.stages import pipeline
-
-    seen = []
-    monkeypatch.setattr(pipeline, "run_demo", lambda job, places, wild: seen.append(job.run.path.name))
-    for words in ([], ["x"]):
-        assert call(monkeypatch, capsys, "demo", *words)[0] == 0
-    assert seen == ["demo", "x"]
-
-
-def test_an_example_without_its_network_ends_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    example = Path(__file__).parents[1] / "examples" / "04_label_photos.py"
-    monkeypatch.setattr(sys, "argv", ["04", str(tmp_path), "a.jpg", "--model", "no/such/network/here"])
-    with pytest.raises(SystemExit, match="no such folder") as end:
-        runpy.run_path(str(example), run_name="__main__")
-    assert str(end.value).count("\n") == 0
-
-
-@pytest.mark.parametrize(
-    "name", ["a[old]b", "[/red]", "\x1b[31mred", "caf\udce9", "\x9b2J", ":car:", "a\u202eb"]
-)
-def test_errors_repeat_what_was_typed_and_obey_none_of_it(
-    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("name", ["[/red]", "\x1b[31mred", "caf\udce9", "a\u202eb"])
+def test_errors_repeat_what_was_typed_and_obey_none_of_it(name: str, command: Call) -> None:
     for words in (["info", name], [name], ["info", ".", name], ["plan", "x", "--ladder", name],
                   ["run", "a", "b", f"--{name}"], ["run", "a", "b", "--train.max-steps", name]):  # fmt: skip
-        code, error = call(monkeypatch, capsys, *words)
+        code, error = command(*words)
         assert code == 2
         assert error.count("\n") == 1
         assert error[:-1].isprintable()
-    assert visible("a[old]b") in call(monkeypatch, capsys, "info", "a[old]b")[1]
+    assert visible("a[old]b") in command("info", "a[old]b")[1]
 
 
 def test_a_path_that_is_not_utf8_is_printed(tmp_path: Path) -> None:

@@ -10,12 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from conftest import Call
 
 from sagesplat.adapt.plan_files import read_plans
 from sagesplat.cli.console import Console
-from sagesplat.core.config import FitConfig, NestConfig, PlanConfig, TrainConfig
+from sagesplat.core.config import FitConfig, PlanConfig, TrainConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import Event, Progress, StageDone, StageSkipped, Training, Warned
+from sagesplat.core.events import Event, StageDone, StageSkipped, Training, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json
@@ -24,12 +25,10 @@ from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import pipeline, preflight, train
 from sagesplat.stages import plan as plan_stage
-from sagesplat.stages.nest import nest_levels
 from sagesplat.stages.train import train_levels
 from sagesplat.studies.paper.snapshots import adapt_snapshots
 
 SETTINGS = "--train.max-steps 60 --train.level-every 30 --ladder snapshots --target-ssim 0.4 --test-every 6"
-Call = Callable[..., tuple[int, str]]
 
 
 class Killed(Exception):
@@ -57,23 +56,6 @@ def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(finished: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(finished, tmp_path / "run"))
-
-
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    def typed(*words: str | Path) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["sagesplat", *map(str, words)])
-        code, text = 0, ""
-        try:
-            from sagesplat import cli
-
-            cli.main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        out = capsys.readouterr()
-        return code, text + out.out + out.err
-
-    return typed
 
 
 def test_flags_of_earlier_commands_are_the_defaults(run: Path, capture: Path, command: Call) -> None:
@@ -246,43 +228,6 @@ def test_a_swap_that_is_killed_is_finished_by_the_same_command(
     assert sorted(files(paths.levels)) == ["000020.npz", "000040.npz"]
     assert len(read_level(paths.levels / "000040.npz"))
     assert not paths.replacement.path.exists()
-
-
-def test_a_killed_training_gives_its_settings_to_the_next_command(capture: Path, tmp_path: Path) -> None:
-    def kill(event: Event) -> None:
-        if isinstance(event, Training) and event.step == 25:
-            raise Killed
-
-    config = replace(pipeline.DEMO, train=TrainConfig(max_steps=50, level_every=10))
-    with pytest.raises(Killed):
-        pipeline.run_all(Job(RunDir(tmp_path / "run"), kill, "cpu"), capture, config)
-    assert recorded_settings(RunDir(tmp_path / "run"))["train"] == config.train
-
-
-def test_a_killed_forced_nest_resumes_and_the_earlier_ladder_stays(run: Path) -> None:
-    paths = RunDir(run)
-    first = NestConfig(steps=20, base_steps=20, levels=3)
-    nest_levels(job(run, print), first, 0)
-    ladder, record = paths.prefixes.read_bytes(), paths.provenance("nest").read_bytes()
-    other, saves = replace(first, steps=24), []
-
-    def kill(event: Event) -> None:
-        if isinstance(event, Progress) and event.name == "nest" and event.done == 15:
-            raise Killed
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sagesplat.train.nested._SAVE_EVERY", 10)
-        with pytest.raises(Killed):
-            nest_levels(job(run, kill), other, 0)
-        assert (paths.prefixes.read_bytes(), paths.provenance("nest").read_bytes()) == (ladder, record)
-        nest_levels(job(run, saves.append), other, 0)
-    steps = [e.done for e in saves if isinstance(e, Progress) and e.name == "nest"]
-    assert min(steps) == 11
-    assert read_json(paths.provenance("nest"))["settings"]["steps"] == 24
-    (done,) = [e for e in saves if isinstance(e, StageDone)]
-    assert "SSIM 0." in done.lines[1]
-    assert "before rounding" in done.lines[1]
-    assert "costs" not in "".join(done.lines)
 
 
 def test_snapshots_are_adapted_with_the_settings_of_the_nested_levels(run: Path) -> None:

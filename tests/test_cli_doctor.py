@@ -12,7 +12,6 @@ from rich.console import Console
 from sagesplat import cli
 from sagesplat.cli import doctor
 from sagesplat.cli.doctor import Finding
-from sagesplat.core.errors import BackendUnavailable
 from sagesplat.core.extras import install
 from sagesplat.raster import cuda
 
@@ -107,21 +106,6 @@ def test_a_machine_with_a_gpu(gpu, monkeypatch) -> None:
     assert doctor.gsplat_kernels(build=False).text.startswith("agree with the reference to 2e-05")
 
 
-def test_building_now(gpu, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(doctor, "_error", lambda backend: 2e-5)
-    monkeypatch.setattr(cuda, "kernels", lambda: print("compiling"))
-    assert doctor.gsplat_kernels(build=True).state == "fine"
-    assert capsys.readouterr() == ("", "compiling\n")
-
-    def fail() -> None:
-        raise BackendUnavailable("they do not compile") from RuntimeError("nvcc fatal\nline 2")
-
-    monkeypatch.setattr(cuda, "kernels", fail)
-    found = doctor.gsplat_kernels(build=True)
-    assert (found.state, found.text) == ("gap", "they do not compile")
-    assert capsys.readouterr().err == "nvcc fatal\nline 2\n"
-
-
 def test_gaps_of_gsplat_and_its_compiler(gpu, monkeypatch) -> None:
     (gpu / "include" / "cuda_runtime.h").unlink()
     found = doctor.compiler()
@@ -138,27 +122,6 @@ def test_gaps_of_gsplat_and_its_compiler(gpu, monkeypatch) -> None:
     monkeypatch.setattr(cuda, "gsplat_version", lambda: None)
     found = doctor.gsplat()
     assert printed([found]).splitlines()[1].endswith(f"→ {install('sagesplat[cuda]')}")  # no markup
-
-
-def test_extras(monkeypatch, tmp_path) -> None:
-    found = doctor.extra("onnx", "no-such-package", "something")
-    assert (found.state, found.cure) == ("gap", install("sagesplat[onnx]"))
-    assert doctor.extra("test", "pytest", "tests").text.startswith("pytest ")
-    monkeypatch.setattr(doctor, "weights_path", lambda net: tmp_path / "none.npz")
-    assert doctor.lpips().cure == "sagesplat download lpips"
-    monkeypatch.setattr(doctor, "weights_path", lambda net: tmp_path)
-    assert doctor.lpips().state == "fine"
-
-
-def test_programs_that_are_not_there_or_fail_say_nothing() -> None:
-    assert doctor._output("no-such-program") == ""
-    assert doctor._output(sys.executable, "-c", "raise SystemExit(3)") == ""
-    assert doctor._output(sys.executable, "-c", "print(5)") == "5"
-
-
-def test_lines_are_not_wrapped_where_they_are_piped() -> None:
-    long = Finding("part", "gap", "word " * 40, "cure " * 40)
-    assert len(printed([long, Finding("a longer part", "fine", "yes")]).splitlines()) == 3
 
 
 def test_building_without_a_gpu_is_an_error(

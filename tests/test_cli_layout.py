@@ -9,7 +9,6 @@ from rich.console import Console as RichConsole
 from sagesplat.cli import console
 from sagesplat.cli.console import Console, Remaining
 from sagesplat.cli.layout import fitted
-from sagesplat.core.durations import duration
 from sagesplat.core.events import Progress, StageDone, StageStarted, TableMade
 
 HEADER = ("category", "level", "Gaussians", "share", "promised", "test", "all", "status")
@@ -67,12 +66,6 @@ def test_remaining_time_does_not_jump_with_the_time_of_a_step() -> None:
     assert told[-1][0] == 0
 
 
-def test_a_stage_that_resumes_does_not_count_what_was_done() -> None:
-    estimate = Remaining()
-    assert estimate(0.0, 900, 1000) is None
-    assert estimate(10.0, 910, 1000) == pytest.approx(90)
-
-
 def test_a_log_gets_few_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
@@ -92,7 +85,3 @@ def test_a_log_gets_few_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     day = lines(86_400)
     assert 100 < len(day) < 160  # every ten minutes
     assert all(" left  loss 0.1" in line for line in day[5:-1])
-
-
-def test_durations() -> None:
-    assert [duration(s) for s in (4.4, 600, 9000)] == ["4 s", "10 min", "2.5 h"]

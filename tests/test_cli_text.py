@@ -1,20 +1,17 @@
 """Segmentation by text as typed, with tiny networks of random weights: masks, run, adopt."""
 
 import json
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from conftest import random_gaussians
+from conftest import Call, random_gaussians
 from text_networks import save
 
 from sagesplat.demo.capture import make_capture
 from sagesplat.formats.ply import write_ply
 
-Call = Callable[..., tuple[int, str]]
 PROMPTS = "stone fountain; ivy; wooden bench"
 SMALL = (
     "--train.max-steps", "40", "--nest.steps", "12", "--nest.levels", "3", "--nest.base-steps", "6",
@@ -31,23 +28,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / kind).mkdir()
         save(folder / kind, kind)
     return folder
-
-
-@pytest.fixture
-def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    def typed(*words: str | Path) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["sagesplat", *map(str, words)])
-        code = 0
-        try:
-            from sagesplat import cli
-
-            cli.main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        out = capsys.readouterr()
-        return code, out.out + out.err
-
-    return typed
 
 
 def names_of(path: Path) -> list[str]:
@@ -100,10 +80,7 @@ def test_a_splat_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
     ("words", "line"),
     [
         (("--prompts", "ivy; Ivy"), "prompts: 'ivy' and 'Ivy' mean the same; leave one of them"),
-        (("--prompts", "tree; the trees"), "prompts: 'tree' and 'the trees' mean the same"),
         (("--prompts", "ivy;; bench"), "one is empty; write --prompts"),
-        (("--prompts", "a,b"), "',' cannot be part of a category; separate prompts by ;"),
-        (("--prompts", "x" * 300), "a name has 1 to 100 printable characters"),
         (("--prompts", "ivy\nbench"), "a name has 1 to 100 printable characters"),
         (("--segmenter", "text"), "--segmenter text needs --prompts"),
         (("--prompts", "ivy", "--labels.instances", "chair 7"), "chair 7"),
@@ -121,18 +98,10 @@ def test_bad_words_are_one_line(
     assert line in last
 
 
-@pytest.mark.parametrize("name", ["<b>bold</b>", "喷泉 & <script>", "ش" * 100])
-def test_names_of_any_script_and_with_markup(folder: Path, tmp_path: Path, command: Call, name: str) -> None:
-    words = (
-        "--segmenter",
-        "text",
-        "--prompts",
-        name,
-        "--model",
-        folder / "clipseg",
-        "--prompt-threshold",
-        "0.01",
-    )
+def test_names_of_any_script_and_with_markup(folder: Path, tmp_path: Path, command: Call) -> None:
+    name = "喷泉 & <script>"
+    network = ("--model", folder / "clipseg", "--prompt-threshold", "0.01")
+    words = ("--segmenter", "text", "--prompts", name, *network)
     code, said = command("masks", folder / "capture", tmp_path / "run", *words)
     assert code == 0, said
     assert names_of(tmp_path / "run" / "masks") == [name]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sagesplat.core.geometry import mean_neighbour_distance, project, to_camera
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30, derandomize=True)
 @given(st.integers(2, 40), st.integers(1, 5), st.integers(0, 1000))
 def test_mean_neighbour_distance_is_brute_force(count, k, seed):
     xyz = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)

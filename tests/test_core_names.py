@@ -35,9 +35,8 @@ def test_awkward_names_are_names(name: str) -> None:
     [
         (3, "no text"), (None, "no text"), ("", "blank"), (" ", "blank"), ("\u3164\u2800", "blank"),
         ("\u0301", "blank"), (" a", "space"), ("a\u00a0", "space"), ("x" * 101, "101 characters"),
-        ("x" * 10**6, "1000000 characters"), ("a\nb", "U+000A"), ("a\x1b[31m", "U+001B"), ("\x7f", "U+007F"),
         ("\x9b", "U+009B"), ("a\u202eb", "U+202E"), ("a\u2066b", "U+2066"), ("a\u200bb", "U+200B"),
-        ("a\u2028b", "U+2028"), ("a\ud800", "not UTF-8"), ("a\ue000", "U+E000"), ("\x00", "U+0000"),
+        ("a\nb", "U+000A"), ("a\ud800", "not UTF-8"),
     ],
 )  # fmt: skip
 def test_what_is_no_name(name: object, why: str) -> None:
@@ -83,12 +82,6 @@ def test_a_name_that_may_be_is_not_repaired(name: str) -> None:
         assert repaired(name) == "scene"
 
 
-@pytest.mark.parametrize("name", [".", "..", "..."])
-def test_dots_are_no_file(name: str) -> None:
-    assert checked(name) == name
-    assert repaired(name) == "scene"
-
-
 @given(ANY, st.integers(0, 300))
 def test_clipping_counts_bytes(text: str, nbytes: int) -> None:
     assert len(clipped(text, nbytes).encode("utf-8", "ignore")) <= nbytes
@@ -104,11 +97,6 @@ def test_slugs_are_short_and_distinct(names: list[str]) -> None:
     found = slugs(dict(enumerate([*names, "tree", "Tree", "tree--1", "日本語"])))
     assert len(set(found.values())) == len(found)
     assert all(re.fullmatch(r"[a-z0-9-]{1,66}", slug) for slug in found.values())
-
-
-def test_slugs_of_common_names_read_like_them() -> None:
-    names = {-1: "unlabelled", 3: "dining table", 184: "sky-other-merged@2"}
-    assert slugs(names) == {-1: "unlabelled", 3: "dining-table", 184: "sky-other-merged-2"}
 
 
 @given(ANY)

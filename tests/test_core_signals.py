@@ -93,10 +93,6 @@ def test_five_quick_signals_are_one_line_and_cleaning_up_is_not_cut_off(
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]
 
 
-def test_exit_codes_are_what_shells_report() -> None:
-    assert [_exit_code(number) for number in LINES] == [2, 143, 129]
-
-
 AT_THE_END = """
 import threading, time
 def wait():
@@ -149,7 +145,7 @@ with deferred():
     while not s._stop.waiting:
         time.sleep(0.01)
     ready()
-    THEN
+    told()  # the test reads one line at a time
     print("begun", flush=True)
     signal.signal(signal.SIGTERM, lambda *_: exit(9))  # as libraries do
 time.sleep(3600)
@@ -157,18 +153,10 @@ time.sleep(3600)
 
 
 def test_what_must_not_be_half_begun_is_finished_first(tmp_path: Path) -> None:
-    process = started(EACH_A_WISH + STARTS.replace("THEN", ""), tmp_path)
+    process = started(EACH_A_WISH + STARTS, tmp_path)
     process.send_signal(signal.SIGTERM)
     is_ready(process)
     assert ended(process) == (143, "begun\n", LINES[signal.SIGTERM])
-
-
-def test_what_hangs_while_it_begins_is_ended_by_a_second_signal(tmp_path: Path) -> None:
-    process = started(EACH_A_WISH + STARTS.replace("THEN", "time.sleep(3600)"), tmp_path)
-    process.send_signal(signal.SIGTERM)
-    is_ready(process)
-    process.send_signal(signal.SIGTERM)
-    assert ended(process) == (143, "", LINES[signal.SIGTERM])
 
 
 WAITS = """
@@ -182,17 +170,6 @@ with answered_at_once():
     ready()
     lock(mutex)  # for ever, and no signal cuts it off
 """
-AFTERWARDS = """
-import time
-from sagesplat.core.signals import answered_at_once
-with answered_at_once():
-    pass
-try:
-    ready()
-    time.sleep(3600)
-finally:
-    print("cleaned", flush=True)
-"""
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="mutexes of other systems are not so simple")
@@ -203,12 +180,6 @@ def test_a_signal_is_answered_while_the_main_thread_waits_in_c(
     process = started(WAITS, tmp_path)
     process.send_signal(number)
     assert ended(process) == (_exit_code(number), "", LINES[number])
-
-
-def test_after_a_block_that_is_answered_at_once_all_is_cleaned_up_again(tmp_path: Path) -> None:
-    process = started(AFTERWARDS, tmp_path)
-    process.send_signal(signal.SIGINT)
-    assert ended(process) == (2, "cleaned\n", LINES[signal.SIGINT])
 
 
 def test_what_nohup_and_shells_ignore_stays_ignored(tmp_path: Path) -> None:
@@ -233,8 +204,3 @@ def test_imports_are_interrupted_in_one_line_too(tmp_path: Path) -> None:
         is_ready(process)
         process.send_signal(signal.SIGINT)
         assert ended(process) == (2, "", LINES[signal.SIGINT])
-
-
-def test_memory_that_runs_out_at_the_very_end_is_not_told_again(tmp_path: Path) -> None:
-    code = "ready()\ndef end():\n    raise MemoryError\nimport atexit\natexit.register(end)"
-    assert ended(started(code, tmp_path)) == (0, "", "")

@@ -14,16 +14,8 @@ from sagesplat.formats.labels import sidecar, write_labels
 from sagesplat.formats.ply import write_ply
 from sagesplat.formats.splat import OPAQUE
 from sagesplat.formats.splats import num_lods, read_splat
-from sagesplat.formats.spz import write_spz
-from tests.fuzz.readers.foreign_splats import (
-    archived,
-    compressed_ply,
-    dotsplat,
-    put_sog,
-    sog,
-    streamed,
-    webp,
-)
+from sagesplat.formats.spz import encode_spz, write_spz
+from tests.fuzz.readers.foreign_splats import archived, compressed_ply, dotsplat, put_sog, sog, streamed, webp
 from tests.fuzz.readers.making import splats
 from tests.test_formats_ply import columns_of, foreign, make, same
 
@@ -108,14 +100,6 @@ def test_none_left(tmp_path):
     refused(tmp_path / "a.splat", "no Gaussians in it")
 
 
-def test_one_gaussian(tmp_path):
-    write_ply(tmp_path / "a.ply", make(1, 15))
-    (tmp_path / "a.splat").write_bytes(dotsplat(1))
-    assert (
-        len(read_splat(tmp_path / "a.ply").gaussians) == len(read_splat(tmp_path / "a.splat").gaussians) == 1
-    )
-
-
 def test_other_files_are_refused_in_one_line(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"\x89PNG\r\n\x1a\n and so on")
     refused(tmp_path / "a.ply", "no splat format that is known")
@@ -170,8 +154,6 @@ def test_a_compressed_ply_that_does_not_fit_together(tmp_path):
         (b"element chunk 2", b"element chunk 1", "1 chunks for 300 Gaussians"),
         (b"uint packed_scale", b"uint packed_stale", "packed_scale"),
         (b"element sh 300", b"element sh 299", "299 rows of 9 harmonics"),
-        (b"element vertex 300", b"element vertex 301", "300 rows of 9 harmonics"),
-        (b"property uchar f_rest_8\n", b"", "harmonics"),
     ):
         (tmp_path / "a.ply").write_bytes(sound.replace(old, new))
         refused(tmp_path / "a.ply", message)
@@ -223,15 +205,10 @@ def test_a_sog_that_does_not_fit_together(tmp_path):
     small = webp(images["sh0.webp"][:2])
     for change, message in (
         ({"count": 10**9}, "1,000,000,000 Gaussians announced"),
-        ({"count": -1}, "-1 Gaussians"),
         ({"version": 3}, "version 3"),
         ({"scales": meta["scales"] | {"codebook": [1.0] * 257}}, "codebook of 257"),
-        ({"scales": meta["scales"] | {"codebook": ["1.0"]}}, "in place of numbers"),
         ({"sh0": meta["sh0"] | {"files": ["../sh0.webp"]}}, "is no file name"),
-        ({"sh0": meta["sh0"] | {"files": ["sh0.png"]}}, "sh0.png cannot be read"),
-        ({"sh0": meta["sh0"] | {"files": ["meta.json"]}}, "an image"),
         ({"means": meta["means"] | {"mins": [0]}}, "in place of 3 numbers"),
-        ({"shN": meta["shN"] | {"bands": 3}}, "3 bands"),
         ({"quats": None}, "not a SOG scene"),
     ):
         path.write_text(json.dumps(meta | change))
@@ -242,15 +219,6 @@ def test_a_sog_that_does_not_fit_together(tmp_path):
     (tmp_path / "shN_labels.webp").write_bytes(webp(images["shN_labels.webp"] * 0 + 255))
     (tmp_path / "sh0.webp").write_bytes(webp(images["sh0.webp"]))
     refused(path, "row 65535 of a palette of 128")
-
-
-def test_a_codebook_that_is_too_short_drops_what_needs_it(tmp_path):
-    meta, images = sog(40, 0)
-    meta["scales"]["codebook"] = meta["scales"]["codebook"][:200]
-    splat = read_splat(put_sog(tmp_path, meta, images))
-    wrong = int((images["scales.webp"].reshape(-1, 4)[:40, :3] >= 200).any(1).sum())
-    assert wrong
-    assert splat.dropped == {"NaN or infinite": wrong}
 
 
 def put_streamed(folder: Path) -> Path:
@@ -280,11 +248,7 @@ def test_a_streamed_sog_that_does_not_fit_together(tmp_path):
     for change, message in (
         ({"filenames": ["../b/meta.json"] * 2}, "is not in its folder"),
         ({"filenames": [str(tmp_path / "b" / "meta.json")] * 2}, "is not in its folder"),
-        ({"filenames": []}, "not a streamed SOG"),
         ({"lodLevels": 0}, "lodLevels: expected int >= 1"),
-        ({"version": 2}, "version: invalid enum value 2"),
-        ({"tree": [1]}, "not a streamed SOG"),
-        ({"tree": {"lods": {"0": leaf | {"offset": -1}}}}, "offset: expected int >= 0"),
         ({"tree": {"lods": {"0": leaf | {"offset": 3}}}}, "do not fit the 6 rows"),
         ({"tree": {"children": [{"lods": {"0": leaf}}] * 2}}, "do not fit the 6 rows"),
         ({"tree": {"lods": {"1": leaf}}}, "level 0 has no Gaussians"),
@@ -340,6 +304,6 @@ def test_labels_beside_a_file(tmp_path):
 
 def test_spz_axes(tmp_path):
     g: Gaussians = make(9, 3)
-    write_spz(tmp_path / "a.spz", g, frame="rdf", fractional_bits=12)
+    (tmp_path / "a.spz").write_bytes(encode_spz(g, frame="rdf", fractional_bits=12))
     close(read_splat(tmp_path / "a.spz", spz_axes="rdf").gaussians.means, g.means, 1e-3)
     close(read_splat(tmp_path / "a.spz").gaussians.means, g.means * torch.tensor([1, -1, -1]), 1e-3)

@@ -17,11 +17,9 @@ from make_stream_vectors import DATA, Case, cases
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
-from sagesplat.formats.spz import SH_BITS
 from sagesplat.formats.stream import MAX_COUNT, decode_stream, encode_stream
 from sagesplat.formats.stream_header import SIZE, Precision
-from sagesplat.raster import rasterize
-from tests.conftest import damage, pinhole, random_gaussians
+from tests.conftest import random_gaussians
 from tests.fuzz.mutate import BYTES
 
 SIZES = [3, 3, 40, 200]
@@ -77,25 +75,6 @@ def test_everything_comes_back_within_half_a_step(degree: int):
     assert ((covariances(h) - covariances(g)) / sizes).abs().max() < 0.04
 
 
-def test_the_picture_stays():
-    g, camera = visible(), pinhole()
-    coded = encode_stream(g, [200], precision=FINE)
-    pictures = [
-        rasterize(some, camera, backend="cpu").rgb for some in (g, decode_stream(coded.content).gaussians)
-    ]
-    assert (pictures[0] - pictures[1]).abs().mean() < 0.003
-
-
-def test_what_was_decoded_is_encoded_without_further_loss():
-    once = decode_stream(encode_stream(visible(), SIZES).content).gaussians
-    coded = encode_stream(once, SIZES)
-    again, once = decode_stream(coded.content).gaussians, once.select(torch.from_numpy(coded.rows))
-    torch.testing.assert_close(again.shN, once.shN, rtol=0, atol=0)
-    torch.testing.assert_close(again.log_scales, once.log_scales, rtol=0, atol=0)
-    torch.testing.assert_close(again.sh0, once.sh0, rtol=0, atol=1e-5)
-    torch.testing.assert_close(again.logit_opacities, once.logit_opacities, rtol=0, atol=1e-5)
-
-
 def test_a_cut_after_a_level_is_the_prefix():
     coded = encode_stream(visible(), SIZES)
     everything = decode_stream(coded.content)
@@ -115,12 +94,6 @@ def test_a_cut_within_a_level_is_an_error():
         decode_stream(coded.content[: coded.ends[0]], 2)
     with pytest.raises(DataError, match="1 bytes after"):
         decode_stream(coded.content + b"\0")
-
-
-@pytest.mark.parametrize("level", [0, 4, -1])
-def test_levels_that_a_stream_does_not_have(level: int):
-    with pytest.raises(DataError, match="of 3"):
-        decode_stream(encode_stream(visible(9), [1, 2, 9]).content, level)
 
 
 def test_invisible_gaussians_are_left_out():
@@ -162,12 +135,6 @@ def test_second_opacities_cost_little_and_are_sent_with_the_first_level_that_nee
     assert 0 < more[2] - sizes[2] < 2000 * 5 / 8 + 20
 
 
-def test_a_second_opacity_that_is_the_only_one_costs_nothing():
-    g = visible(2000, degree=0)
-    same = encode_stream(g, [2000], second=SecondOpacities(g.logit_opacities, {0: (1.0,)}))
-    assert len(same.content) - len(encode_stream(g, [2000]).content) < 5
-
-
 def test_gaussians_that_no_level_shows_are_left_out():
     g = visible(8, degree=0)
     g.logit_opacities[:] = torch.tensor([3.0, 3.0, -9.0, -9.0, 3.0, -9.0, 3.0, -9.0])
@@ -201,10 +168,6 @@ def test_second_opacities_of_others_are_refused():
         encode_stream(g, [2, 5], second=SecondOpacities(g.logit_opacities * torch.nan, {0: (0.0, 1.0)}))
 
 
-def test_the_same_gaussians_give_the_same_bytes():
-    assert encode_stream(visible(), SIZES).content == encode_stream(visible(), SIZES).content
-
-
 def test_a_trained_model_needs_few_bytes():
     g = visible(3000)
     g = replace(g, shN=g.shN * (g.shN.abs() > 0.15))
@@ -223,7 +186,7 @@ def test_golden_streams_stay_byte_for_byte(case: Case):
         np.testing.assert_allclose(values, wanted, atol=1e-6)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.integers(0, 3),
     st.lists(st.integers(0, 40), min_size=1, max_size=6).map(sorted),
@@ -243,10 +206,9 @@ def test_any_gaussians_come_back(degree: int, sizes: list[int], logit: float, ex
 
 
 @pytest.mark.parametrize("field", PARAMETERS)
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_nan_and_infinity_are_refused(field: str, value: float):
+def test_nan_and_infinity_are_refused(field: str):
     g = visible(3)
-    getattr(g, field).view(-1)[0] = value
+    getattr(g, field).view(-1)[0] = float("nan")
     with pytest.raises(DataError, match=f"tree: .* {field}"):
         encode_stream(g, [3], name="tree")
 
@@ -262,17 +224,7 @@ def test_what_cannot_be_encoded():
         encode_stream(replace(g, means=g.means * 1e20), [3])
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"opacity": 300},
-        {"log_scale": 0.0},
-        {"sh_bits": (9, 9)},
-        {"rotation": 10.0},
-        {"position": 300.0},
-        {"least": 0.4},
-    ],
-)
+@pytest.mark.parametrize("wrong", [{"opacity": 300}, {"log_scale": 0.0}, {"sh_bits": (9, 9)}])
 def test_a_precision_that_the_format_does_not_have(wrong: dict[str, Any]):
     with pytest.raises(ValueError, match=r"the format|are there"):
         Precision(**wrong)
@@ -283,13 +235,9 @@ def test_a_precision_that_the_format_does_not_have(wrong: dict[str, Any]):
     [
         (0, b"X", "not a sagesplat-stream"),
         (4, b"\1", "a stream of version 1, and not 2; use the version of sagesplat that wrote it"),
-        (4, b"\3", "a stream of version 3"),
         (5, b"\4", "unknown flags 4"),
-        (6, b"\4", "degree 4"),
         (7, b"\0", "0 levels"),
-        (9, b"\x09", "degree"),
         (24, b"\0\0\xc0\x7f", "impossible steps"),
-        (24, b"\0\0\0\0", "impossible steps"),
         (12, b"\0\0\x80\x7f", "impossible steps"),
     ],
 )
@@ -300,20 +248,12 @@ def test_impossible_headers(at: int, value: bytes, words: str):
         decode_stream(bytes(content), name="x.sgst")
 
 
-@pytest.mark.parametrize("count", [MAX_COUNT, 2**28 - 1, 1300])
-def test_more_gaussians_than_bytes_can_hold(count: int):
+def test_more_gaussians_than_bytes_can_hold():
+    count = MAX_COUNT
     content = encode_stream(visible(5), [5]).content[:SIZE]
     number = bytes([count & 127 | 128, count >> 7 & 127 | 128, count >> 14 & 127 | 128, count >> 21])
     with pytest.raises(DataError, match=f"{count} Gaussians in 10"):
         decode_stream(content + number + b"\x0a" + b"\x55" * 10)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.data())
-def test_damage_ends_as_one_error(data: st.DataObject):
-    content = encode_stream(visible(20, degree=1), [5, 20]).content
-    with suppress(DataError):
-        decode_stream(damage(content, data))
 
 
 def test_a_thousand_mutations_are_errors_or_gaussians():
@@ -338,7 +278,3 @@ def test_equal_gaussians_take_the_least_bytes():
     coded = encode_stream(g, [20_000])
     assert 10 < 20_000 / len(coded.content) < 97
     assert len(decode_stream(coded.content).gaussians) == 20_000
-
-
-def test_defaults_are_the_steps_of_training():
-    assert Precision().sh_bits == SH_BITS

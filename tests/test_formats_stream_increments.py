@@ -13,14 +13,7 @@ from conftest import random_gaussians
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
-from sagesplat.formats.increments import (
-    Increment,
-    full_scene,
-    read_increments,
-    read_index,
-    shown,
-    totals,
-)
+from sagesplat.formats.increments import Increment, full_scene, read_increments, read_index, shown, totals
 from sagesplat.formats.stream_increments import Streams, read_streams, write_streams
 from sagesplat.io.typed import convert_as
 

@@ -74,26 +74,3 @@ def test_exceptions_are_needed(run_by_readers: set[str]):
     foreign = {name for name, reason in EXCEPTIONS.items() if reason not in (OURS, MACHINE)}
     assert sorted(EXCEPTIONS.keys() - reading) == []
     assert sorted(foreign & run_by_readers) == []
-
-
-def test_names_of_readers_differ():
-    names = [reader.name for reader in READERS]
-    assert len(set(names)) == len(names)
-
-
-def test_what_counts_as_reading(tmp_path: Path):
-    (tmp_path / "a.py").write_text(
-        "import json, torch\n"
-        "class A:\n"
-        "    def read(self, path):\n"
-        "        def inner():\n"
-        "            return torch.load(path)\n"
-        "        return json.loads(path.read_text()), path.open('rb'), inner()\n"
-        "def write(path, job):\n"
-        "    path.open('wb'), open(path, mode), job.spec.open(1), job.load(2), path.write_text('x')\n"
-    )
-    found = {(name, call) for name, call, _ in readers_in(tmp_path)}
-    assert found == {
-        ("a:A.read", "json.loads"), ("a:A.read", "path.read_text"), ("a:A.read", "path.open"),
-        ("a:A.read.inner", "torch.load"), ("a:write", "open"),
-    }  # fmt: skip

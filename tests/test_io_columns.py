@@ -11,7 +11,7 @@ from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.core.errors import DataError
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), count=st.integers(0, 6))
 @pytest.mark.parametrize(("kind", "read"), [(Observations, read_observations), (Evaluation, read_evaluation)])
 def test_tables_read_back_identical(tmp_path, kind, read, data, count):

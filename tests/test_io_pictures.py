@@ -3,7 +3,6 @@
 import ast
 import os
 import struct
-import subprocess
 import sys
 import warnings
 import zlib
@@ -17,8 +16,7 @@ from PIL import Image, ImageFile
 import sagesplat
 from sagesplat.core.errors import SceneError
 from sagesplat.core.extras import install
-from sagesplat.io import pictures
-from sagesplat.io.pictures import PictureError, open_picture
+from sagesplat.io.pictures import open_picture
 from sagesplat.scene._prepare import prepare_photos
 from sagesplat.scene.images import as_rgb, load_photo, photo_size
 from sagesplat.scene.scene import Camera, View
@@ -96,10 +94,7 @@ def test_postscript_starts_no_program(tmp_path: Path, monkeypatch: pytest.Monkey
     ("content", "name"),
     [
         (b"DDS |" + bytes(200), "DDS"),
-        (b"GIF89a" + bytes(20), "GIF"),
-        (b"SIMPLE  =                    T" + bytes(200), "FITS"),
         (b"P6\n60 40 255\n" + NOISE.tobytes(), "PPM"),
-        (b"\xd7\xcd\xc6\x9a" + bytes(40), "WMF"),
         (b"\0\0\0\x18ftypmp42\0\0\0\0mp41isom", "video"),
         (b"<!DOCTYPE html>", "SVG, XML or HTML"),
     ],
@@ -123,7 +118,7 @@ def test_heic_without_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_a_pipe_is_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.png")
-    assert "(it is no regular file)" in refused(lambda: photo_size(tmp_path / "a.png"))
+    assert "(no regular file)" in refused(lambda: photo_size(tmp_path / "a.png"))
 
 
 def test_bombs_are_refused_before_they_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,9 +136,9 @@ def test_bombs_are_refused_before_they_are_decoded(tmp_path: Path, monkeypatch: 
     )
 
 
-@pytest.mark.parametrize(("width", "height"), [(12000, 9000), (16320, 12240)])
-def test_phones_take_200_megapixels(tmp_path: Path, width: int, height: int) -> None:
-    """As dark as a photo can be. Pillow by itself warns of the first, and refuses the second."""
+def test_phones_take_200_megapixels(tmp_path: Path) -> None:
+    """As dark as a photo can be; Pillow by itself refuses it."""
+    width, height = 16320, 12240
     (tmp_path / "a.jpg").write_bytes(jpeg_of(width, height, width * height // 64))
     assert photo_size(tmp_path / "a.jpg") == (width, height)
     assert Image.MAX_IMAGE_PIXELS == 1024**3 // 4 // 3
@@ -158,62 +153,12 @@ def test_a_huge_jpeg_is_decoded_at_reduced_size(tmp_path: Path, monkeypatch: pyt
     assert np.abs(load(tmp_path / "a.jpg", 80, 60) - expected).max() < 3
 
 
-def test_a_white_render_is_fine(tmp_path: Path) -> None:
-    Image.new("RGB", (4000, 3000), (255, 255, 255)).save(tmp_path / "a.png")
-    assert (tmp_path / "a.png").stat().st_size < 50_000
-    assert (load(tmp_path / "a.png", 40, 30) == 255).all()
-
-
-MEASURE = """
-import sys
-from pathlib import Path
-import numpy as np
-from sagesplat.scene.images import load_photo
-from sagesplat.scene.scene import Camera, View
-def peak():  # kB
-    return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
-before = peak()
-camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 40, 30)
-load_photo(View("a", camera, Path(sys.argv[1])))
-print(peak() - before)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="asks Linux")
-def test_memory_of_a_deep_picture(tmp_path: Path) -> None:
-    """64 million bytes of floats in a file of 63 kB: 16 bytes a pixel, where it took 28."""
-    path = tmp_path / "a.tif"
-    Image.new("F", (4096, 4000), 0.5).save(path, compression="tiff_adobe_deflate")
-    taken = subprocess.run([sys.executable, "-c", MEASURE, str(path)], capture_output=True, check=True)
-    assert int(taken.stdout) * 1024 < 16 * 4096 * 4000
-
-
-def test_a_float_picture_larger_than_its_file(tmp_path: Path) -> None:
-    strips = [zlib.compress(bytes(4 * 20000 * 2000), 1)] * 10
-    content, offsets = b"II*\0", []
-    for strip in strips:
-        offsets.append(8 + len(content) - 4)
-        content += strip
-    at = 8 + len(content) - 4
-    counts = [len(strip) for strip in strips]
-    content = b"II*\0" + struct.pack("<I", at + 80) + content[4:] + struct.pack("<20I", *offsets, *counts)
-    tags = [(256, 4, 1, 20000), (257, 4, 1, 20000), (258, 3, 1, 32), (259, 3, 1, 8), (262, 3, 1, 1)]
-    tags += [(273, 4, 10, at), (277, 3, 1, 1), (278, 4, 1, 2000), (279, 4, 10, at + 40), (339, 3, 1, 3)]
-    entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
-    (tmp_path / "a.tif").write_bytes(content + struct.pack("<H", len(tags)) + entries + bytes(4))
-    assert "20000 x 20000 pixels, more than" in refused(lambda: load(tmp_path / "a.tif"))
-
-
 @pytest.mark.parametrize(
     "error",
     [
         MemoryError(),
         struct.error("unpack requires\na buffer"),
         SyntaxError("broken PNG file"),
-        RuntimeError("decoder"),
-        zlib.error("Error -3"),
-        OverflowError(),
-        RecursionError("maximum depth"),
         OSError(5, "Input/output error"),
         Image.DecompressionBombError("\x1b[31m"),
         Image.DecompressionBombWarning("large"),
@@ -235,13 +180,9 @@ def test_warnings_of_pillow_stay_inside(tmp_path: Path) -> None:
         warnings.warn("Corrupt EXIF data", stacklevel=1)
 
 
-def formats() -> list[str]:
-    return ["jpg", "png", "tif", "webp", "bmp", "avif", "heic"]
-
-
-@pytest.mark.parametrize("suffix", formats())
+@pytest.mark.parametrize("suffix", ["avif", "heic"])
 def test_damaged_pictures(tmp_path: Path, suffix: str) -> None:
-    """Whatever bytes are wrong or missing: a picture, or one line with its path."""
+    """As `tests/fuzz` damages all others: a picture, or one line with its path."""
     path = tmp_path / f"a.{suffix}"
     if suffix == "heic":
         pytest.importorskip("pi_heif")
@@ -339,32 +280,6 @@ def test_tags_of_a_tiff(tmp_path: Path, tags: list[tuple[int, int, int, bytes]],
         assert (load(tmp_path / "a.tif", 10, 10) == 0).all()
 
 
-def test_numbers_in_the_exif_of_a_tiff(tmp_path: Path) -> None:
-    content = tiff((37386, 5, 2000, bytes(16000)))
-    at = struct.unpack_from("<I", content, 4)[0]
-    forged = tiff((34665, 4, 1, b""))
-    pointer = forged.index(struct.pack("<HHI", 34665, 4, 1)) + 8
-    padded = forged.ljust(1000, b"\0")
-    forged = padded[:pointer] + struct.pack("<I", 1000 + at) + padded[pointer + 4 :] + content
-    (tmp_path / "a.tif").write_bytes(forged)
-    assert "too many numbers" in refused(lambda: load(tmp_path / "a.tif"))
-
-
-def test_a_fax_is_no_photo(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Of its damaged rows libtiff printed a line each."""
-    Image.new("1", (64, 4000)).save(tmp_path / "a.tif", compression="group4")
-    content = bytearray((tmp_path / "a.tif").read_bytes())
-    content[8:60] = bytes(range(52))
-    (tmp_path / "a.tif").write_bytes(content)
-    assert "(a TIFF packed as group4); convert it to PNG" in refused(lambda: load(tmp_path / "a.tif"))
-    assert capfd.readouterr() == ("", "")
-
-
-def test_a_damaged_header_is_called_so(tmp_path: Path) -> None:
-    (tmp_path / "a.tif").write_bytes(tiff((338, 3, 5000, bytes(10000))))
-    assert "(its header is damaged)" in refused(lambda: load(tmp_path / "a.tif"))
-
-
 def plainly(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
     """`as_rgb` of the whole image at once."""
     if image.mode.startswith("I") or image.mode == "F":
@@ -427,28 +342,14 @@ def test_only_jpeg_and_png_reach_colmap_as_they_are(tmp_path: Path) -> None:
     assert kinds == {"a.jpg": ("PNG", ".png"), "b.jpg": ("PNG", ".png"), "c.png": ("JPEG", ".jpg")}
 
 
-@pytest.mark.parametrize("planted", [b"%!PS", png(9, 9), jpeg_of(60, 40, 99)])
-def test_a_prepared_photo_from_elsewhere_is_made_again(tmp_path: Path, planted: bytes) -> None:
+def test_a_prepared_photo_from_elsewhere_is_made_again(tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     photos.mkdir()
     Image.fromarray(NOISE).convert("L").save(photos / "a.png")
     (first,), _ = prepare_photos(photos, tmp_path / "t", tmp_path / "t", lambda done, total: None)
     prepared = tmp_path / "t" / first.prepared
     expected, mtime = prepared.read_bytes(), prepared.stat().st_mtime_ns
-    prepared.write_bytes(planted)
+    prepared.write_bytes(png(9, 9))
     os.utime(prepared, ns=(mtime, mtime))
     prepare_photos(photos, tmp_path / "t", tmp_path / "t", lambda done, total: None)
     assert prepared.read_bytes() == expected
-
-
-def test_a_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(PictureError, match="No such file or directory"), open_picture(tmp_path / "a.png"):
-        pass
-
-
-def test_every_promised_suffix_has_a_format() -> None:
-    from sagesplat.scene.detect import PHOTOS
-
-    Image.init()
-    known = {suffix: kind for suffix, kind in Image.EXTENSION.items() if kind in pictures.PHOTO_FORMATS}
-    assert PHOTOS - set(known) <= {".heic", ".heif"}

@@ -3,11 +3,8 @@
 import re
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from functools import partial
 from html import unescape
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
@@ -94,46 +91,6 @@ def test_pages_are_sound_on_a_phone(site, browser, scheme):
             assert opened.complaints == [], name
 
 
-OUTSIDE = """() => {
-  const at = document.activeElement;
-  const box = at.getBoundingClientRect();
-  const inside = box.right > 0 && box.bottom > 0 && box.left < innerWidth && box.top < innerHeight;
-  return [at === document.body, inside ? "" : at.outerHTML.slice(0, 120)];
-}"""
-
-
-FOCUSED = """(drawer) => {
-  const link = [...document.querySelectorAll(`${drawer} a`)].find((a) => a.getClientRects().length);
-  link.focus();
-  const box = link.getBoundingClientRect();
-  return [link === document.activeElement, box.left >= 0 && box.right <= innerWidth];
-}"""
-
-
-@pytest.mark.slow
-def test_the_focus_stays_on_the_screen_of_a_phone(site, browser):
-    """Drawers beside the screen take no focus while they are closed, and the keyboard opens them."""
-    with open_page((site / "labels.html").as_uri(), (360, 740), browser=browser) as opened:
-        page = opened.page
-        page.add_style_tag(content="* { scroll-behavior: auto !important; transition: none !important; }")
-        found = list[str]()
-        for _ in range(100):
-            page.keyboard.press("Tab")
-            ended, outside = page.evaluate(OUTSIDE)
-            if ended:
-                break
-            found.append(outside)
-        assert len(found) > 10
-        assert list(filter(None, found)) == []
-        for switch, drawer in (("#__navigation", ".sidebar-drawer"), ("#__toc", ".toc-drawer")):
-            assert page.evaluate(FOCUSED, drawer)[0] is False
-            page.focus(switch)
-            page.keyboard.press("Space")
-            assert page.evaluate(FOCUSED, drawer) == [True, True]
-            page.focus(switch)
-            page.keyboard.press("Space")
-
-
 @pytest.mark.slow
 def test_search_finds_a_flag_from_the_disk(site, browser):
     address = f"{(site / 'search.html').as_uri()}?q=freeze-at"
@@ -141,19 +98,3 @@ def test_search_finds_a_flag_from_the_disk(site, browser):
         found = opened.wait_for("document.querySelectorAll('#search-results li a').length")
         assert found > 0
         assert opened.complaints == []
-
-
-@pytest.mark.slow
-def test_scenes_of_the_gallery_are_live(site, browser):
-    if not any((site / "gallery").glob("*.html")):
-        pytest.skip("no scenes in build/gallery; `make gallery` makes one")
-    handler = partial(SimpleHTTPRequestHandler, directory=str(site))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{server.server_port}/gallery.html"
-        with open_page(address, (700, 500), browser=browser) as opened:
-            inside = "document.querySelector('iframe.bundle').contentWindow.sagesplat"
-            opened.page.evaluate("document.querySelector('iframe.bundle').scrollIntoView()")
-            assert opened.wait_for(f"{inside} && {inside}.ready.then(() => {inside}.state().count > 0)", 60)
-            assert opened.complaints == []
-        server.shutdown()

@@ -10,7 +10,7 @@ import pytest
 import torch
 from conftest import pinhole, random_gaussians
 
-from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.core.errors import DataError, RunError
 from sagesplat.formats.increments import write_increments
 from sagesplat.viewer import single_file
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents
@@ -128,12 +128,3 @@ def test_what_browsers_do_not_open_is_refused(tmp_path, viewer, contents, monkey
     ):
         write_single_file(tmp_path / "a.html", contents, viewer)
     assert not (tmp_path / "a.html").exists()
-
-
-def test_a_viewer_of_another_layout_or_none(tmp_path, viewer, contents) -> None:
-    (viewer / "index.html").write_text("<!doctype html><body></body>")
-    with pytest.raises(SageError, match="not a viewer that fits into a page; run `make web`"):
-        write_single_file(tmp_path / "a.html", contents, viewer)
-    (viewer / "index.html").unlink()
-    with pytest.raises(SageError, match="viewer not built"):
-        write_single_file(tmp_path / "a.html", contents, viewer)

@@ -4,7 +4,6 @@ import gzip
 import shutil
 import socket
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import browser
@@ -12,7 +11,7 @@ import pytest
 
 pytest.importorskip("starlette", reason="needs the extra `view`")
 pytest.importorskip("uvicorn", reason="needs the extra `view`")
-from test_viewer_server import ask, running, viewing, wait_for, write_files
+from test_viewer_server import ask, running, viewing, write_files
 
 from sagesplat.stages.view import show
 from sagesplat.viewer import site
@@ -203,33 +202,6 @@ def test_the_page_shows_the_bundle_s_poster(tmp_path: Path):
         status, headers, body = ask(port, "/")
         assert (status, b'src="poster.jpg"' in body, headers["cache-control"]) == (200, True, "no-cache")
         assert ask(port, "/poster.jpg")[1]["content-type"] == "image/jpeg"
-
-
-@pytest.mark.slow
-def test_who_leaves_stops_the_reading_of_the_file(bundle: Path, viewer: Path):
-    served, begun, ended = site.Site(bundle, viewer=viewer), [], []
-
-    async def watched(scope, receive, send) -> None:
-        begun.append(scope)
-        await served(scope, receive, send)
-        ended.append(scope)
-
-    with (bundle / "endless.spz").open("wb") as file:
-        file.truncate(2**40)
-    with running(watched) as port, socket.create_connection(("127.0.0.1", port)) as connection:
-        connection.sendall(b"GET /endless.spz HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        assert connection.recv(1000)
-        assert (len(begun), len(ended)) == (1, 0)
-        connection.close()
-        wait_for(lambda: ended)
-    (bundle / "endless.spz").unlink()
-
-
-@pytest.mark.slow
-def test_two_hundred_at_once(port: int):
-    names = [list(FILES)[index % len(FILES)] for index in range(200)]
-    with ThreadPoolExecutor(200) as pool:
-        assert all(pool.map(lambda name: ask(port, "/" + name)[2] == FILES[name], names))
 
 
 PAGE = b"""<!doctype html><title>page</title><link rel=stylesheet href=assets/look-1a2b3c4d.css>

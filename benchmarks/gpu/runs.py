@@ -148,10 +148,7 @@ def multi(bench: Bench) -> Outcome:
     if bench.small or torch.cuda.device_count() < 2:
         return Outcome("skipped", "no GPU" if bench.small else "one GPU")
     steps = min(bench.asked.steps, 1000)
-    config, args = (
-        TrainConfig(max_steps=steps, **AS_GSPLAT),
-        (bench.scene, bench.photos, bench.labels),
-    )
+    config, args = (TrainConfig(max_steps=steps, **AS_GSPLAT), (bench.scene, bench.photos, bench.labels))
     seconds = {}
     for name, events in {
         "one": trainer.train(*args, config, backend="cuda"),
@@ -326,11 +323,7 @@ def loss_times(bench: Bench) -> dict[str, float]:
     photo = torch.rand(camera.height, camera.width, 3, device=bench.device)
     name, recipe = gsplat_trainer.losses()
     found = {}
-    for of, loss in {
-        "ours": photometric_loss,
-        "torch": gsplat_trainer.torch_loss,
-        name: recipe,
-    }.items():
+    for of, loss in {"ours": photometric_loss, "torch": gsplat_trainer.torch_loss, name: recipe}.items():
         rgb = torch.rand_like(photo).requires_grad_()
         found[of] = milliseconds(bench.device, lambda loss=loss, rgb=rgb: loss(rgb, photo, 0.2).backward())
     return found

@@ -1,4 +1,4 @@
-"""The simulation of internet scale: days, caches, money, with the figures of docs/scaling.md.
+"""The simulation of internet scale: days and caches, with the figures of docs/scaling.md.
 
     python -m benchmarks.scaling --out DIR [--viewers 1000 100000]
 
@@ -15,7 +15,7 @@ from typing import Any
 import tyro
 
 from benchmarks.common import RESULTS, ROOT, finish, origin
-from benchmarks.scaling import figures, prices
+from benchmarks.scaling import figures
 from benchmarks.scaling.cdn import Site, simulate
 from benchmarks.scaling.theory import per_visit, pop_hits
 from benchmarks.scaling.visits import KINDS, Library, read
@@ -33,7 +33,7 @@ CACHES = (0.05e9, 0.2e9, 0.5e9, 1e9, 2e9, 5e9, 20e9, 50e9)
 def main(
     out: Path, visits: Path = RESULTS, viewers: tuple[int, ...] = VIEWERS, seed: int = 0, write: bool = False
 ) -> None:
-    """Internet scale by simulation: visits, caches of a CDN, money.
+    """Internet scale by simulation: visits, caches of a CDN.
 
     Args:
         out: folder for JSON, CSV and figures.
@@ -65,23 +65,15 @@ def run(visits: Path, out: Path, viewers: Sequence[int], seed: int) -> dict[str,
     result: dict[str, Any] = origin() | {"site": asdict(base), "bundles": list(small.names)}
     result["visits"] = {name: means(library) for name, library in named.items()}
     result["days"] = days(small, base, viewers)
-    result["caches"] = {
-        "as recorded": sweep(small, middle),
-        "ten times the bytes": sweep(large, middle),
-    }
+    result["caches"] = {"as recorded": sweep(small, middle), "ten times the bytes": sweep(large, middle)}
     result["variants"] = variants(small, files, middle)
-    result |= money(small, large, replace(base, viewers=1_000_000), viewers)
     write_json(out / "scaling.json", result)
     with (out / "scaling-days.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(result["days"][0]))
         writer.writeheader()
         writer.writerows(result["days"])
     shown = {"as recorded (92 k Gaussians)": small, "ten times the bytes": large}
-    drawn = {
-        "visits": figures.visits(shown),
-        "hits": figures.hits(result["days"], result["caches"]),
-        "cost": figures.sensitivity(result["sensitivity"], result["base_per_1000_visits"]),
-    }
+    drawn = {"visits": figures.visits(shown), "hits": figures.hits(result["days"], result["caches"])}
     for name, figure in drawn.items():
         figure.savefig(out / f"scaling-{name}.png", dpi=110)
     return result
@@ -145,24 +137,6 @@ def variants(library: Library, files: Library, site: Site) -> dict[str, dict[str
     for name, row in rows.items():
         tell(name, row)
     return rows
-
-
-def money(library: Library, larger: Library, base: Site, viewers: Sequence[int]) -> dict[str, Any]:
-    """Bills of a month by viewers and price list, and what moves the bill."""
-    service = prices.Service(base, prices.Storage())
-    bills = []
-    for count in viewers:
-        for sheet in prices.SHEETS:
-            here = replace(service, site=replace(base, viewers=count))
-            bill = prices.bill(library, here, sheet)
-            each = prices.per_1000_visits(library, here, sheet)
-            bills.append({"viewers": count, "prices": sheet.name, **bill, "per_1000_visits": each})
-    return {
-        "bills": bills,
-        "sources": {sheet.name: sheet.source for sheet in prices.SHEETS},
-        "sensitivity": prices.sensitivity(library, larger, service),
-        "base_per_1000_visits": prices.per_1000_visits(library, service, prices.MIDDLE),
-    }
 
 
 def tell(name: str, row: dict[str, Any]) -> None:

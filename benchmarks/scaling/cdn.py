@@ -271,12 +271,7 @@ def lay_out(library: Library, site: Site) -> Objects:
     sizes = np.where(library.grows[bundle], library.sizes[bundle] * factor[:, None], library.sizes[bundle])
     size = np.ceil(sizes).astype(np.int64).ravel()
     weights = np.arange(1, site.scenes + 1) ** -site.zipf
-    return Objects(
-        bundle=bundle,
-        size=size,
-        factor=factor,
-        popularity=np.cumsum(weights / weights.sum()),
-    )
+    return Objects(bundle=bundle, size=size, factor=factor, popularity=np.cumsum(weights / weights.sum()))
 
 
 def _batches(

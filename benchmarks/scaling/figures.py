@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from benchmarks.scaling.visits import KINDS, Library
-from sagesplat.output.figures import FAINT, INK, STYLE
+from sagesplat.output.figures import INK, STYLE
 
 GREEN, AMBER, RED, BLUE = "#2f6f56", "#d6a10b", "#c2410c", "#3b6ea8"
 SHADES = {"viewer": "#b9c2cf", "manifest": INK, "promises": BLUE, "pack": GREEN, "chunk": AMBER}
@@ -75,23 +75,3 @@ def _plain(axis: Axis) -> None:
     """Numbers of a logarithmic axis as they are, none between powers of ten."""
     axis.set_major_formatter("{x:,g}")
     axis.set_minor_formatter(NullFormatter())
-
-
-@rc_context(STYLE)
-def sensitivity(rows: Sequence[tuple[str, str, float, str, float]], base: float) -> Figure:
-    """Dollars for a thousand visits when one input moves from low to high, what moves most on top."""
-    figure = Figure(figsize=(9, 0.42 * len(rows) + 1.1), layout="constrained")
-    axes = figure.subplots()
-    for y, (_, low_name, low, high_name, high) in enumerate(rows):
-        axes.barh(y, high - low, left=low, height=0.5, color=GREEN)
-        axes.text(low / 1.08, y, low_name, ha="right", va="center", fontsize=8, color=INK)
-        axes.text(max(low, high) * 1.08, y, high_name, ha="left", va="center", fontsize=8, color=INK)
-    axes.axvline(base, color=FAINT, lw=1, ls="--")
-    axes.set_yticks(range(len(rows)), [row[0] for row in rows])
-    axes.set_xscale("log")
-    smallest, largest = min(row[2] for row in rows), max(row[4] for row in rows)
-    axes.set(xlabel="US dollars for 1000 visits", xlim=(smallest / 6, largest * 6))
-    _plain(axes.xaxis)
-    axes.grid(visible=False, axis="y")
-    axes.invert_yaxis()
-    return figure

@@ -22,7 +22,6 @@ _COMMON = {
     "--blocks.count", "--ladder", "--target-fidelity", "--target-ssim", "--budget", "--device", "--seed",
     "--force", "--yes",
 }  # fmt: skip
-_INDENT = " " * 6
 _WIDEST = 100  # characters of a line
 _KINDS: dict[Any, str] = {bool: "", str: "TEXT", Path: "PATH", dict: "NAME VALUE ..."}
 

@@ -89,20 +89,7 @@ def run(
     from sagesplat.stages import pipeline
 
     config = RunConfig(
-        scene_config,
-        poses,
-        masks,
-        labels,
-        train,
-        clean,
-        blocks,
-        nest,
-        sample,
-        fit,
-        plan,
-        fuse,
-        ladder,
-        seed,
+        scene_config, poses, masks, labels, train, clean, blocks, nest, sample, fit, plan, fuse, ladder, seed
     )
     with open_job(run, machine, ladder) as job:
         pipeline.run_all(job, scene, config)

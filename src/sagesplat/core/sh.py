@@ -15,6 +15,8 @@ _C31 = math.sqrt(21 / (32 * math.pi))
 _C30 = math.sqrt(7 / (16 * math.pi))
 _C322 = math.sqrt(105 / (16 * math.pi))
 
+BASES = (0, 3, 8, 15)  # basis functions beyond the constant one, by degree 0 to 3
+
 
 def num_bases(degree: int) -> int:
     """Number of basis functions up to `degree`, including the constant one."""

@@ -20,8 +20,8 @@ import torch
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.sh import C0
-from sagesplat.formats.ply import BASES, is_antialiased
+from sagesplat.core.sh import BASES, C0
+from sagesplat.formats.ply import is_antialiased
 from sagesplat.formats.quantisation import largest_restored, logits_of_bytes
 from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.io.ply_header import Element, read_elements

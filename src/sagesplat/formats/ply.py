@@ -16,13 +16,13 @@ from sagesplat import __version__
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
+from sagesplat.core.sh import BASES
 from sagesplat.formats.labels import sidecar, write_labels
 from sagesplat.formats.splat import Splat, SplatReader, SplatWriter
 from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import read_header
 
 ROWS = 4096  # Gaussians per block, so that a block fits into the processor's cache
-BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to 3
 
 
 def write_ply(
@@ -211,9 +211,7 @@ def _matrices(gaussians: Gaussians) -> list[np.ndarray]:
 
 def _gaussians(columns: np.ndarray, labels: np.ndarray) -> Gaussians:
     """Gaussians from float32 columns [P, N] in the order of `_properties`, without normals."""
-    rest = columns[6:-8].reshape(
-        3, (len(columns) - 14) // 3, columns.shape[1]
-    )  # [3, K, N]: all red, all green, all blue
+    rest = columns[6:-8].reshape(3, -1, columns.shape[1])  # [3, K, N]: all red, all green, all blue
 
     def rows(part: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(part, -1, 0)))

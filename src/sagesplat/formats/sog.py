@@ -21,7 +21,7 @@ import torch
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.ply import BASES
+from sagesplat.core.sh import BASES
 from sagesplat.formats.quantisation import largest_restored, logits_of_bytes
 from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.io.files import loads_json, regular

@@ -23,8 +23,8 @@ from sagesplat import __version__
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import morton_order
+from sagesplat.core.sh import BASES
 from sagesplat.formats.labels import NO_PARENTS, write_or_remove_labels
-from sagesplat.formats.ply import BASES
 from sagesplat.formats.quantisation import OTHERS
 from sagesplat.formats.sog import META
 from sagesplat.formats.splat import SplatWriter, check_writable

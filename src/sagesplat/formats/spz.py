@@ -42,7 +42,6 @@ from sagesplat.formats.quantisation import (
 from sagesplat.formats.splat import Frame, Splat, SplatReader, SplatWriter, check_writable
 from sagesplat.formats.spz_container import (
     ANTIALIASED,
-    BASES,
     MAGIC,
     MAX_BITS,
     MAX_COUNT,
@@ -66,34 +65,20 @@ def write_spz(
     path: Path | str,
     g: Gaussians,
     *,
-    sh_degree: int | None = None,
     antialiased: bool = False,
-    fractional_bits: int | None = None,
-    sh_bits: tuple[int, int] = SH_BITS,
-    coarse: bool = False,
     frame: Frame = "rub",
     version: Literal[3, 4] = 3,
     names: Mapping[int, str] | None = None,
     parents: Mapping[int, str] | None = None,
 ) -> int:
-    """Write an SPZ file atomically. Arguments and errors are those of `encode_spz`.
+    """Write an SPZ file atomically. Arguments and errors are those of `encode_spz`, which has more.
 
     Returns:
         The size of the file in bytes.
     """
     path = Path(path)
     content = encode_spz(
-        g,
-        sh_degree=sh_degree,
-        antialiased=antialiased,
-        fractional_bits=fractional_bits,
-        sh_bits=sh_bits,
-        coarse=coarse,
-        frame=frame,
-        version=version,
-        names=names,
-        parents=parents,
-        name=str(path),
+        g, antialiased=antialiased, frame=frame, version=version, names=names, parents=parents, name=str(path)
     )
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
@@ -103,7 +88,6 @@ def write_spz(
 def encode_spz(
     g: Gaussians,
     *,
-    sh_degree: int | None = None,
     antialiased: bool = False,
     fractional_bits: int | None = None,
     sh_bits: tuple[int, int] = SH_BITS,
@@ -122,7 +106,6 @@ def encode_spz(
 
     Args:
         g: The Gaussians, on any device.
-        sh_degree: Harmonics up to this degree are written; None: all there are.
         antialiased: How the scene was trained; a flag for viewers.
         fractional_bits: Positions are rounded to 2^-bits world units. None: to at most an eighth of the size
             of nine in ten Gaussians, or what the extent allows.
@@ -158,9 +141,7 @@ def encode_spz(
     if len(g) > MAX_COUNT:
         raise DataError(f"{name}: {len(g)} Gaussians; SPZ readers take {MAX_COUNT}, write several files")
     check_writable(g, name)
-    degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
-    means, quats, harmonics = g.means.numpy(), g.quats.numpy(), g.shN[:, : BASES[degree]].numpy()
-    means, quats, harmonics = flipped(means, quats, harmonics, frame)
+    means, quats, harmonics = flipped(g.means.numpy(), g.quats.numpy(), g.shN.numpy(), frame)
     bits = _fractional_bits(name, means, g.log_scales.numpy(), fractional_bits, coarse)
     opacity_step, colour_step, scale_step, rotation_step = _COARSE if coarse else (1, 1, 1, 1)
     fixed = np.rint(means.astype(np.float64) * 2.0**bits).astype("<i4")
@@ -174,26 +155,23 @@ def encode_spz(
     ]
     flags = ANTIALIASED if antialiased else 0
     if version == 3:
-        return gzipped(len(g), degree, bits, flags, attributes)
+        return gzipped(len(g), g.sh_degree, bits, flags, attributes)
     records = {} if names is None else {_LABELS: as_json(g.label_ids, names, parents or {})}
     if frame != "rub":
         records[_AXES] = _FRAMES.index(frame, 1).to_bytes(4, "little")
-    return zstd_packed(len(g), degree, bits, flags, attributes, records)
+    return zstd_packed(len(g), g.sh_degree, bits, flags, attributes, records)
 
 
-def packing_order(
-    g: Gaussians, *, sh_degree: int | None = None, sh_bits: tuple[int, int] = SH_BITS
-) -> Int64[np.ndarray, " N"]:
+def packing_order(g: Gaussians) -> Int64[np.ndarray, " N"]:
     """The order by SH coefficients, then colour, which compresses 3 to 5 % better than Morton order.
 
-    Use it as `g.select(torch.from_numpy(order))`, with the options of `encode_spz`. Neighbours in the file
-    are then not neighbours in space; some viewers draw spatially sorted files faster.
+    Use it as `g.select(torch.from_numpy(order))`. Neighbours in the file are then not neighbours in space;
+    some viewers draw spatially sorted files faster.
     """
     g = g.detach().to("cpu")
-    degree = g.sh_degree if sh_degree is None else min(sh_degree, g.sh_degree)
-    harmonics = in_buckets(g.shN[:, : BASES[degree]], sh_bits).numpy()
+    harmonics = in_buckets(g.shN, SH_BITS).flatten(1).numpy()
     colours = np.argsort(morton_order(g.sh0[:, 0].numpy()))  # ranks
-    return np.lexsort((colours, *harmonics.reshape(len(g), 3 * BASES[degree]).T[::-1]))
+    return np.lexsort((colours, *harmonics.T[::-1]))
 
 
 def read_spz(path: Path | str, label_id: int = -1, *, frame: Frame = "rub") -> Gaussians:
@@ -278,8 +256,7 @@ def _fractional_bits(
     if wanted is None:
         return min(most, _enough_bits(log_scales, 2 if coarse else 8))
     if not 0 <= wanted <= most:
-        allowed = f"positions up to {extent:.3g} allow 0 to {most}"
-        raise DataError(f"{name}: {wanted} fractional bits; {allowed}")
+        raise DataError(f"{name}: {wanted} fractional bits; positions up to {extent:.3g} allow 0 to {most}")
     return wanted
 
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sagesplat.core.errors import DataError, short
+from sagesplat.core.sh import BASES
 
 MAX_BITS = 24  # fractional bits; readers refuse more
 MAX_COUNT = 10_000_000  # Gaussians; the reference implementation reads no more
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
-BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree 0 to 3
 ANTIALIASED, _EXTENSIONS = 1, 2  # flags
 _HEADER_4 = struct.Struct("<4sIIBBBBI12x")
 _STREAM = struct.Struct("<QQ")

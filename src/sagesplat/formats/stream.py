@@ -18,6 +18,7 @@ from torch import Tensor
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
+from sagesplat.formats.splat import check_writable
 from sagesplat.formats.stream_columns import (
     AXIS_BITS,
     Columns,
@@ -245,18 +246,13 @@ def _check(name: str, g: Gaussians, sizes: Sequence[int], second: SecondOpacitie
         raise ValueError(f"levels of {sizes[-1]} Gaussians, of {len(g)}")
     if len(g) > MAX_COUNT:
         raise DataError(f"{name}: {len(g)} Gaussians; a stream holds {MAX_COUNT}, write several")
-    values_of = g.parameters()
-    if second:
-        if len(second.logits) != len(g) or len(_weights(second)) != len(sizes):
-            raise ValueError(f"{len(second.logits)} second opacities of {len(g)} Gaussians, or other levels")
-        values_of |= {"second opacities": second.logits}
-    for key, values in values_of.items():
-        if bad := int((~torch.isfinite(values)).sum()):
-            raise DataError(f"{name}: {bad} values of {key} are NaN or infinite; train the scene again")
+    if second and (len(second.logits) != len(g) or len(_weights(second)) != len(sizes)):
+        raise ValueError(f"{len(second.logits)} second opacities of {len(g)} Gaussians, or other levels")
+    check_writable(g, name)
+    if second and not torch.isfinite(second.logits).all():
+        raise DataError(f"{name}: second opacities are NaN or infinite; train the scene again")
     if float(g.means.abs().max() if len(g) else 0) > _FARTHEST:
         raise DataError(f"{name}: positions beyond {_FARTHEST:.0e} units; scale the scene down")
-    if bad := int((~g.quats.any(1)).sum()):
-        raise DataError(f"{name}: {bad} Gaussians have a rotation of zeros; train the scene again")
 
 
 def _reader(tables: Tables, payload: bytes, count: int) -> Reader | None:

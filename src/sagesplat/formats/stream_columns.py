@@ -9,11 +9,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Int64
 
+from sagesplat.core.sh import BASES
 from sagesplat.kernels.rans import BITS, Coder
 
 AXIS_BITS = 17  # of a position: a Morton code has 51, which a float64 holds
 ROTATIONS = (4, 6, 8, 11, 16, 23, 32, 45, 64, 90, 127)  # steps from 0 to sqrt(1/2), by class
-BASES = (0, 3, 8, 15)  # SH coefficients beyond the constant one, by degree
 LARGEST = 2**18 - 1  # magnitude of a value; differences of two have 20 bits
 _ESCAPE_BITS = 20
 _OFFSET = 1 << (_ESCAPE_BITS - 1)

@@ -10,9 +10,10 @@ from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.sh import BASES
 from sagesplat.formats.quantisation import PER_COLOUR, in_buckets, logits_of_bytes
 from sagesplat.formats.spz import flipped
-from sagesplat.formats.stream_columns import AXIS_BITS, BASES, LARGEST, ROTATIONS, Columns, Layout
+from sagesplat.formats.stream_columns import AXIS_BITS, LARGEST, ROTATIONS, Columns, Layout
 
 MAGIC, VERSION = b"SGST", 2
 _HEADER = struct.Struct("<4sBBBBBBBBffffffhhhH")

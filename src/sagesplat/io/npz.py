@@ -8,19 +8,17 @@ from typing import IO, Any
 
 import numpy as np
 
-_DEFLATE = 1032  # largest expansion ratio of a deflate stream
 _KINDS = "biufU"  # numpy kinds that are read: numbers and text
 
 
 class Npz:
     """The arrays of an .npz file by name, each read on access.
 
-    All arrays together need no more memory than the file's size. With `packed` the file may be compressed;
-    then the bound is 1032 times the size. OSError if the file cannot be opened, KeyError for a missing
-    array, ValueError with a short message for any other defect.
+    All arrays together need no more memory than the file's size: it must not be compressed. OSError if the
+    file cannot be opened, KeyError for a missing array, ValueError with a short message for any other defect.
     """
 
-    def __init__(self, path: Path, *, packed: bool = False):
+    def __init__(self, path: Path):
         most = path.stat().st_size
         try:
             self._file = zipfile.ZipFile(path)
@@ -31,7 +29,7 @@ class Npz:
         infos = self._file.infolist()
         self._infos = {info.filename.removesuffix(".npy"): info for info in infos}
         try:
-            _check(infos, most, packed)
+            _check(infos, most)
         except ValueError:
             self._file.close()
             raise
@@ -80,11 +78,10 @@ def _header(member: IO[bytes], size: int) -> tuple[tuple[int, ...], bool, np.dty
     return shape, fortran, dtype
 
 
-def _check(infos: list[zipfile.ZipInfo], most: int, packed: bool) -> None:
-    """ValueError if members use another compression, overlap, or announce more than they can hold."""
-    allowed = {zipfile.ZIP_STORED: 1} | ({zipfile.ZIP_DEFLATED: _DEFLATE} if packed else {})
+def _check(infos: list[zipfile.ZipInfo], most: int) -> None:
+    """ValueError if members are compressed, overlap, or announce more than they can hold."""
     if sum(info.compress_size for info in infos) > most:
         raise ValueError("its members are larger than the file")
     for info in infos:
-        if info.file_size > allowed.get(info.compress_type, 0) * info.compress_size:
+        if info.compress_type != zipfile.ZIP_STORED or info.file_size > info.compress_size:
             raise ValueError(f"{info.filename[:40]!r} is compressed, or larger than it can be")

@@ -5,7 +5,6 @@ Pillow by itself opens some sixty formats, and starts Ghostscript for PostScript
 
 import importlib
 import logging
-import stat
 import struct
 import threading
 import warnings
@@ -14,10 +13,11 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from io import BufferedReader, BytesIO
 from pathlib import Path
 
-from PIL import Image, ImageFile, UnidentifiedImageError
+from PIL import Image, ImageFile, UnidentifiedImageError, features
 
 from sagesplat.core.errors import short
 from sagesplat.core.extras import install
+from sagesplat.io.files import regular
 
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "AVIF", "HEIF")
 FREE_PIXELS = 2**24  # a picture may have as many, however small its file is
@@ -130,14 +130,7 @@ def _without_warnings() -> AbstractContextManager[None]:
 
 
 def _opened_source(source: Path | bytes) -> BufferedReader:
-    return BufferedReader(BytesIO(source)) if isinstance(source, bytes) else _regular(source).open("rb")  # type: ignore[arg-type]
-
-
-def _regular(path: Path) -> Path:
-    """The path of a regular file: reading a pipe or a device may never end."""
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise PictureError("it is no regular file")
-    return path
+    return BufferedReader(BytesIO(source)) if isinstance(source, bytes) else regular(source).open("rb")  # type: ignore[arg-type]
 
 
 def _checked_format(file: BufferedReader, formats: Sequence[str]) -> str:
@@ -156,7 +149,7 @@ def _checked_format(file: BufferedReader, formats: Sequence[str]) -> str:
     else:
         # Or Pillow would import all of its plugins to find this one.
         importlib.import_module(f"PIL.{_PLUGINS[kind]}ImagePlugin")
-    if kind == "AVIF" and not _has_avif():
+    if kind == "AVIF" and not features.check("avif"):
         raise PictureError("this Pillow cannot read AVIF", install("pillow", "--upgrade"))
     return kind
 
@@ -173,12 +166,6 @@ def _format(head: bytes) -> str | None:
             return "HEIF"
         return "camera raw" if brands[:3] == b"crx" else "video"
     return next((name for magic, name in _MAGIC if head.startswith(magic)), None)
-
-
-def _has_avif() -> bool:
-    from PIL import features
-
-    return bool(features.check("avif"))
 
 
 def _register_heif() -> None:

@@ -26,9 +26,8 @@ _MOST_DOTS = 64  # in a line of TOML: its parser keeps every prefix of a key of 
 
 
 def read_json_as(
-    path: Path, kind: type[Kind], what: str, cure: str, error: type[SageError] = DataError,
-    *, strict: bool = True,
-) -> Kind:  # fmt: skip
+    path: Path, kind: type[Kind], what: str, cure: str, error: type[SageError] = DataError
+) -> Kind:
     """The content of a JSON file, checked and converted.
 
     Args:
@@ -37,11 +36,10 @@ def read_json_as(
         what: What a file with other content is not, for the message: "the scene of a run".
         cure: What to do about it.
         error: What is raised, with one line: path, what is wrong, cure.
-        strict: Without it, numbers in quotes are numbers too, as some tools write them.
     """
     content = read_json(path, cure, error)
     with refused(path, what, cure, error):
-        return convert_as(content, kind, strict=strict)
+        return convert_as(content, kind)
 
 
 def known_json(path: Path, kind: type[Kind]) -> Kind | None:
@@ -70,7 +68,10 @@ def read_toml(path: Path, cure: str, *, most: int) -> dict[str, Any]:
 
 
 def convert_as(value: Any, kind: type[Kind], *, strict: bool = True) -> Kind:
-    """A value of parsed JSON or TOML, checked and converted; ValueError, which says where, for others."""
+    """A value of parsed JSON or TOML, checked and converted; ValueError, which says where, for others.
+
+    Without `strict`, numbers in quotes are numbers too, as some tools write them.
+    """
     try:
         return msgspec.convert(value, kind, strict=strict, str_keys=True, dec_hook=_custom)
     except (msgspec.ValidationError, RecursionError) as error:

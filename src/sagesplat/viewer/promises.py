@@ -49,10 +49,7 @@ class Seen:
 
 
 def promises_document(
-    quality: QualityKind,
-    models: Mapping[int, ViewModel],
-    cameras: Sequence[Camera],
-    seen: Mapping[int, Seen],
+    quality: QualityKind, models: Mapping[int, ViewModel], cameras: Sequence[Camera], seen: Mapping[int, Seen]
 ) -> dict[str, Any]:
     """The document of at least one model. `cameras`: the V viewpoints that `seen` is about."""
     extent = next(iter(models.values())).extent

@@ -26,11 +26,7 @@ def of_files(model: ViewModel, files: Sequence[int], last: int) -> ViewModel:
         if same := [level for level in known if first <= level < after]:
             columns.append(known.index(same[-1]))
             curves.append(replace(model.curves[columns[-1]], level=number))
-    return replace(
-        model,
-        curves=tuple(curves),
-        weights=model.weights[:, columns],
-    )
+    return replace(model, curves=tuple(curves), weights=model.weights[:, columns])
 
 
 def quality_entry(model: ViewModel) -> dict[str, Any]:

@@ -25,9 +25,10 @@ from sagesplat.segment.instances import read_instances, write_instances
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Taxonomy, read_mask, write_mask
 from tests.fuzz.hostile import MIB, Reader
-from tests.fuzz.readers.making import PHOTOS, as_json, file, put, put_photos, written
+from tests.fuzz.readers.making import PHOTOS, as_json, documents, file, put, put_photos, written, written_by
 
-NAMES = {"unlabelled": 255, "labels": {"184": "tree-merged", "7": "sky"}}
+TAXONOMY = Taxonomy({1: "sky", 2: "tree"})
+FRAMES = {"size": 9, "mtime_ns": 9, "max_frames": 9}
 CAMERA = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 16, 12)
 
 
@@ -135,10 +136,10 @@ def _write_mask(ids: np.ndarray, taxonomy: Taxonomy, path: Path) -> None:
     write_mask(path, ids, taxonomy)
 
 
-def _instances(folder: Path, size: int) -> list[bytes]:
+def _write_instances(path: Path, size: int) -> None:
     numbers = np.zeros((3 * size, 4 * size), np.int16)
     numbers[:2, :3] = [[1, 2, -1], [2, 2, 1]]
-    return [written(folder / "i.png", lambda path: write_instances(path, numbers))]
+    write_instances(path, numbers)
 
 
 def _valid(folder: Path, size: int) -> list[bytes]:
@@ -159,28 +160,15 @@ def _import(folder: Path, content: bytes) -> None:
     import_masks(scene, folder / "given", folder / "taken")
 
 
-def _labels(folder: Path, size: int) -> list[bytes]:
-    more = {str(1000 + i): f"thing {i}" for i in range(size - 1)}
-    return as_json({"unlabelled": 255, "labels": {**NAMES["labels"], **more}})  # type: ignore[dict-item]
-
-
-def _panoptic(folder: Path, size: int) -> list[bytes]:
+def _panoptic(size: int) -> Any:
     segments = [{"id": 7 + i, "category_id": 1} for i in range(size)]
     entries = [{"file_name": "a.png", "segments_info": segments}]
-    return as_json({"categories": [{"id": 1, "name": "sky"}], "annotations": entries})
-
-
-def _read_panoptic(path: Path) -> None:
-    read_panoptic(path.parent)
-
-
-def _frames(folder: Path, size: int) -> list[bytes]:
-    return as_json({"size": 9, "mtime_ns": 9, "max_frames": 9, "frames": ["frame_000001.jpg"] * size})
+    return {"categories": [{"id": 1, "name": "sky"}], "annotations": entries}
 
 
 def _read_frames(path: Path) -> None:
     (path.parent / "frame_000001.jpg").touch()
-    video._finished(path.parent, {"size": 9, "mtime_ns": 9, "max_frames": 9})
+    video._finished(path.parent, FRAMES)
 
 
 def _videos(folder: Path, size: int) -> list[bytes]:
@@ -215,22 +203,10 @@ POSES = {
 }
 
 
-def _requests(folder: Path, size: int) -> list[bytes]:
-    return as_json(REQUEST | {"photos": ["a.jpg"] * size, "min_photos": 3, "threads": -1})
-
-
-def _read_request(path: Path) -> None:
-    photos._resume(path.parents[1], REQUEST)
-
-
 def _poses(folder: Path, size: int) -> list[bytes]:
     (folder / "sparse/0").mkdir(parents=True, exist_ok=True)
     put(folder / "sfm/request.json", json.dumps(REQUEST).encode())
     return as_json(POSES | {"unregistered": {f"{i}.jpg": "no overlap" for i in range(size)}})
-
-
-def _read_poses(path: Path) -> None:
-    photos._resume(path.parent, REQUEST)
 
 
 READERS = (
@@ -240,19 +216,20 @@ READERS = (
     Reader("ply-points", ".ply", points, file("p.ply", read_points)),
     # Without a PLY file there are 100,000 random points.
     Reader("transforms", ".json", _transforms, file("transforms.json", load_transforms), 3000, 64 * MIB),
-    Reader(
-        "mask",
-        ".png",
-        _masks,
-        file("m.png", lambda path: read_mask(path, Taxonomy({1: "sky", 2: "tree"}))),
-    ),
-    Reader("instances", ".png", _instances, file("i.png", read_instances)),
+    Reader("mask", ".png", _masks, file("m.png", lambda path: read_mask(path, TAXONOMY))),
+    Reader("instances", ".png", written_by("i.png", _write_instances), file("i.png", read_instances)),
     Reader("label-image", ".png", _masks, _import),
     Reader("valid", ".png", _valid, file("v.png", lambda path: read_black(path, 192)), 100, 16 * MIB),
-    Reader("labels", ".json", _labels, file("labels.json", Taxonomy.read), 1000),
-    Reader("panoptic", ".json", _panoptic, file("p.json", _read_panoptic), 1000),
+    Reader("labels", ".json", documents(lambda n: {"labels": {str(i): f"thing {i}" for i in range(n)}}),
+           file("labels.json", Taxonomy.read), 1000),
+    Reader("panoptic", ".json", documents(_panoptic),
+           file("p.json", lambda path: read_panoptic(path.parent)), 1000),
     Reader("video", ".mp4", _videos, file("v.mp4", _read_video), 60, 16 * MIB),
-    Reader("video-frames", ".json", _frames, file("video.json", _read_frames), 1000),
-    Reader("poses-request", ".json", _requests, file("sfm/request.json", _read_request), 1000),
-    Reader("poses", ".json", _poses, file("poses.json", _read_poses), 1000),
-)
+    Reader("video-frames", ".json", documents(lambda n: FRAMES | {"frames": ["frame_000001.jpg"] * n}),
+           file("video.json", _read_frames), 1000),
+    Reader("poses-request", ".json",
+           documents(lambda n: REQUEST | {"photos": ["a.jpg"] * n, "min_photos": 3, "threads": -1}),
+           file("sfm/request.json", lambda path: photos._resume(path.parents[1], REQUEST)), 1000),
+    Reader("poses", ".json", _poses,
+           file("poses.json", lambda path: photos._resume(path.parent, REQUEST)), 1000),
+)  # fmt: skip

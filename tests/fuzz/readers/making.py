@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,24 @@ def put(path: Path, content: bytes) -> Path:
 def file(name: str, read: Callable[[Path], Any]) -> Callable[[Path, bytes], Any]:
     """A reader of a path as one of content; `name` is the file's."""
     return lambda folder, content: read(put(folder / name, content))
+
+
+Make = Callable[[Path, int], list[bytes]]
+
+
+def written_by(name: str, write: Callable[[Path, int], Any]) -> Make:
+    """A maker of what a function writes to a path, by size."""
+    return lambda folder, size: [written(folder / name, lambda path: write(path, size))]
+
+
+def noted(entries: Mapping[str, Any]) -> Make:
+    """A maker of a document with these entries, and with as many others as the size says."""
+    return documents(lambda size: {**entries, **{f"note{i}": i for i in range(size - 1)}})
+
+
+def documents(*made: Callable[[int], Any]) -> Make:
+    """A maker of JSON: a document by size, or several."""
+    return lambda folder, size: as_json(*(document(size) for document in made))
 
 
 def as_json(*documents: Any) -> list[bytes]:

@@ -14,6 +14,7 @@ from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.core.events import Event
 from sagesplat.formats import label_edits
 from sagesplat.io import lock
+from sagesplat.io.columns import from_rows
 from sagesplat.io.files import read_json
 from sagesplat.run import remote
 from sagesplat.run.capture import fingerprint, photo_hashes
@@ -46,19 +47,31 @@ from sagesplat.train.sky import Shell, Sky, read_sky, write_sky
 from sagesplat.viewer.bundle import is_bundle
 from tests.fuzz.hostile import MIB, Reader
 from tests.fuzz.readers.captures import points
-from tests.fuzz.readers.making import PHOTOS, as_json, file, put, put_photos, written
-from tests.fuzz.readers.splats import CHUNK
+from tests.fuzz.readers.making import (
+    PHOTOS,
+    Make,
+    as_json,
+    documents,
+    file,
+    noted,
+    put,
+    put_photos,
+    written,
+    written_by,
+)
+from tests.fuzz.readers.splats import CHUNK, checkpoints
 
-CURVE = {
-    "label_id": 2,
-    "level": 1,
-    "d_range": [1, 9.5],
-    "median": 0.8,
-    "rmse": 0.01,
-    "num_observations": 7,
-    "status": "",
+MEASURED = dict.fromkeys(("plain", "exposed", "cc"), 20.5)
+FIGURES = {
+    "poses": {"pixels": 0.3, "degrees": 0.1, "shift": 0.01, "diverged": 1, "fitted": 2, "held_out": 3}
+    | {"psnr": [20.5, 24.0], "ssim": None},
+    "exposure": {"range_ev": 1.4, "psnr": MEASURED, "ssim": None},
 }
+COUNTS, DECIBELS = dict.fromkeys(CRITERIA, 3), {"train": 20.5, "calibration": 19.0}
+FLOATERS = {"gaussians": 50, "found": COUNTS, "removed": COUNTS, "before": DECIBELS, "after": DECIBELS}
+CURVE = {"label_id": 2, "level": 1, "d_range": [1, 9.5], "median": 0.8, "rmse": 0.01, "num_observations": 7}
 CHOICE = {"label_id": 2, "level": 1, "predicted": 0.8, "distance": None, "count": 3, "status": ""}
+CAMERA = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 3)
 TRAINED = {"antialiased": True, "max_steps": 9, "seed": 3}
 SWEEP = """targets = [0.4, 0.3]
 seeds = [0, 5]
@@ -74,10 +87,6 @@ def _ignore(event: Event) -> None:
     pass
 
 
-def _json(folder: Path, size: int) -> list[bytes]:
-    return as_json({"a": [1, "x", None, 1.5] * size}, [[], {}])
-
-
 def _refined(folder: Path, size: int) -> list[bytes]:
     w2c, exposure = (np.tile(np.eye(n, 4, dtype=np.float32), (3 * size, 1, 1)) for n in (4, 3))
     cameras = RefinedCameras(w2c, exposure, np.zeros(len(w2c), bool))
@@ -89,24 +98,10 @@ def _read_refined(path: Path) -> None:
     read_refined(path, int(path.with_name("views").read_text()))
 
 
-def _sky(folder: Path, size: int) -> list[bytes]:
+def _write_sky(path: Path, size: int) -> None:
     xyz = np.tile(np.array([[20, 0, 1], [0, 20, 1]], np.float32), (20 * size, 1))
     sky = Sky(Shell(np.array([0, 0, 1], np.float32), 20.0, 2.0, (3, 9)), xyz, np.ones(xyz.shape, np.uint8))
-    return [written(folder / "s.npz", lambda path: write_sky(path, sky))]
-
-
-def _figures(folder: Path, size: int) -> list[bytes]:
-    numbers = {"pixels": 0.3, "degrees": 0.1, "shift": 0.01, "diverged": 1, "fitted": 2, "held_out": 3}
-    entry = numbers | {"psnr": [20.5, 24.0], "ssim": None}
-    measured = dict.fromkeys(("plain", "exposed", "cc"), 20.5)
-    exposure = {"range_ev": 1.4, "psnr": measured, "ssim": None}
-    return as_json({"poses": entry, "exposure": exposure} | {f"note{i}": i for i in range(size - 1)})
-
-
-def _floaters(folder: Path, size: int) -> list[bytes]:
-    counts, decibels = dict.fromkeys(CRITERIA, 3), {"train": 20.5, "calibration": 19.0}
-    entry = {"gaussians": 50, "found": counts, "removed": counts, "before": decibels, "after": decibels}
-    return as_json(entry | {f"note{i}": i for i in range(size - 1)})
+    write_sky(path, sky)
 
 
 def _models(folder: Path, size: int) -> list[bytes]:
@@ -128,14 +123,12 @@ def _promises(folder: Path, size: int) -> list[bytes]:
     return as_json({"promises": [entry | {"label_id": 2 + i} for i in range(size)]})
 
 
-def _viewpoints(folder: Path, size: int) -> list[bytes]:
-    camera = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 3)
-    drawn = viewpoints.Viewpoints(viewpoints.Rule(), "capture", (camera,) * size, ("fit",) * size)
-    return [written(folder / "v.json", lambda path: viewpoints.write_viewpoints(path, drawn))]
+def _write_viewpoints(path: Path, size: int) -> None:
+    drawn = viewpoints.Viewpoints(viewpoints.Rule(), "capture", (CAMERA,) * size, ("fit",) * size)
+    viewpoints.write_viewpoints(path, drawn)
 
 
-def _read_cameras(path: Path) -> None:
-    viewpoints.read_cameras(path, Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 4, 3))
+_viewpoints = written_by("v.json", _write_viewpoints)
 
 
 def _camera_files(folder: Path, size: int) -> list[bytes]:
@@ -159,12 +152,12 @@ def _cameras(folder: Path, size: int) -> list[bytes]:
     return [*as_json(frames), *_viewpoints(folder, size)]
 
 
-def _sampled(folder: Path, size: int) -> list[bytes]:
+def _write_sampled(path: Path, size: int) -> None:
     table = fidelity.SampledFidelity(
         (3, 7), np.full((size, 2, 3), 0.5, np.float32), np.full((size, 2), 4, np.int32),
         np.full(size, 9, np.int32), np.ones((size, 3), np.float32), np.ones((size, 2), np.float32),
     )  # fmt: skip
-    return [written(folder / "f.npz", lambda path: fidelity.write_sampled(path, table))]
+    fidelity.write_sampled(path, table)
 
 
 def _plans(folder: Path, size: int) -> list[bytes]:
@@ -180,27 +173,16 @@ def _read_plans(path: Path) -> None:
     plan_files.read_budget_plan(path)
 
 
-def _table(kind: Any) -> Any:
+def _table(kind: Any) -> Make:
     """Makers of the CSV files of a kind of table."""
-
-    def make(folder: Path, size: int) -> list[bytes]:
-        rows = {name: np.full(2 * size, 1, dtype) for name, dtype in _types(kind).items()}
-        return [written(folder / "t.csv", kind(**rows).write_csv)]
-
-    return make
+    row = dict.fromkeys((field.name for field in fields(kind)), 1)
+    return written_by("t.csv", lambda path, size: from_rows(kind, [row] * 2 * size).write_csv(path))
 
 
-def _types(kind: Any) -> dict[str, Any]:
-    from sagesplat.io.columns import _types as types
-
-    return types(kind)
-
-
-def _partition(folder: Path, size: int) -> list[bytes]:
+def _write_partition(path: Path, size: int) -> None:
     low, high = np.array([[-np.inf, 0], [1, -np.inf]]), np.array([[1, np.inf], [np.inf, 2.5]])
     blocks = Blocks(np.eye(3)[:2], low, high, 0.5)
-    made = {"points": [3, 4], "views": [5, 6], "sees": [[1], [0]], "note": [3.5] * size}
-    return [written(folder / "b.json", lambda path: write_blocks(path, blocks, **made))]
+    write_blocks(path, blocks, points=[3, 4], views=[5, 6], sees=[[1], [0]], note=[3.5] * size)
 
 
 def _read_partition(path: Path) -> None:
@@ -212,11 +194,11 @@ def _sweep(folder: Path, size: int) -> list[bytes]:
     return [(SWEEP + "".join(f'scenes.s{i} = "demo"\n' for i in range(size - 1))).encode()]
 
 
-def _comparison(folder: Path, size: int) -> list[bytes]:
+def _write_comparison(path: Path, size: int) -> None:
     fields: Any = [dict.fromkeys(kind.__dataclass_fields__, 1) for kind in (OfLabel, Point, Walk)]
     named = {"method": "SAGE", "name": "0.8", "labels": {2: OfLabel(**fields[0])}}
     point, walk = Point(**fields[1] | named), Walk(**fields[2] | {"method": "SAGE", "keeps": True})
-    return [written(folder / "c.json", lambda path: write_comparison(path, [point] * size, [walk]))]
+    write_comparison(path, [point] * size, [walk])
 
 
 @cache
@@ -287,14 +269,6 @@ def _read_shown(path: Path) -> None:
     input_hashes(run, [path])
 
 
-def _taxonomies(folder: Path, size: int) -> list[bytes]:
-    return as_json({str(i): f"thing {i}" for i in range(size)})
-
-
-def _read_taxonomy(path: Path) -> None:
-    segmenters._begin(path.parent, Taxonomy({0: "thing 0"}), [])
-
-
 def _caps(folder: Path, size: int) -> list[bytes]:
     put(folder / "scene.json", _scenes(folder, 1)[0])
     return as_json({"cap": 900, "settings": TRAINED | {f"note{i}": i for i in range(size - 1)}})
@@ -304,15 +278,6 @@ def _read_cap(path: Path) -> None:
     run = RunDir(path.parent)
     recorded_settings(run)
     read_cap(path)
-
-
-def _options(folder: Path, size: int) -> list[bytes]:
-    more = {f"note{i}": i for i in range(size - 1)}
-    return as_json({"masks": "/p", "classes": None, "segmenter": "onnx", "keep": ["sky"], **more})
-
-
-def _read_options(path: Path) -> None:
-    recorded_settings(RunDir(path.parents[1]))
 
 
 def _manifest(folder: Path, size: int) -> list[bytes]:
@@ -333,27 +298,9 @@ def _read_manifest(path: Path) -> None:
     view._is_current(RunDir(path.parent / "run"), path.parent)
 
 
-def _begun(folder: Path, size: int) -> list[bytes]:
-    """A checkpoint from which a bundle of a training reads one setting."""
-    from tests.fuzz.readers.splats import _checkpoints
-
-    return _checkpoints(folder, size)
-
-
 def _read_begun(path: Path) -> None:
+    """A checkpoint, from which a bundle of a training reads one setting."""
     live_bundle.trains_antialiased(Job(RunDir(path.parent), _ignore))
-
-
-def _frozen(folder: Path, size: int) -> list[bytes]:
-    return as_json({str(label): 500 for label in range(2 * size)})
-
-
-def _edits(folder: Path, size: int) -> list[bytes]:
-    return as_json({"table": [0, 7, -1, *range(size)], "labels": {"7": "sky"}})
-
-
-def _read_edits(path: Path) -> None:
-    label.read_edit_table(path, Taxonomy({0: "sky", 2: "tree"}))
 
 
 def _label_edits(folder: Path, size: int) -> list[bytes]:
@@ -365,83 +312,71 @@ def _label_edits(folder: Path, size: int) -> list[bytes]:
     return [label_edits.dump_edits(label_edits.LabelEdits("0" * 64, (*listed, *more)))]
 
 
-def _parents(folder: Path, size: int) -> list[bytes]:
-    parents = {f"chair {i}": "chair" for i in range(size)}
-    return [written(folder / "p.json", lambda path: write_parents(path, parents))]
-
-
-def _edited(folder: Path, size: int) -> list[bytes]:
+def _write_edited(path: Path, size: int) -> None:
     settings = LabelSettings({f"sky {i}": 2.0 for i in range(size)}, ("sky",), ("tree",))
-    return [
-        written(folder / "edited.json", lambda path: write_edited(RunDir(path.parent), "r", [], settings))
-    ]
+    write_edited(RunDir(path.parent), "r", [], settings)
 
 
-def _read_edited(path: Path) -> None:
-    label_settings(RunDir(path.parent))
-
-
+OPTIONS = {"masks": "/p", "classes": None, "segmenter": "onnx", "keep": ["sky"]}
 NETWORK = {"segmenter": "onnx", "model": "0" * 64}
-
-
-def _networks(folder: Path, size: int) -> list[bytes]:
-    return as_json(NETWORK | {f"note{i}": i for i in range(size - 1)})
-
-
-def _read_network(path: Path) -> None:
-    label._is(path, NETWORK)
-
-
-def _scores(folder: Path, size: int) -> list[bytes]:
-    return as_json({"best": {f"prompt {i}": 0.5 for i in range(size)}, "threshold": 0.3}, {"best": []})
-
-
-def _live(folder: Path, size: int) -> list[bytes]:
-    return as_json({"of": {"level": "1.npz", "written": 9}, "kept": [["chunks/a.spz"] * size]})
-
-
-def _lock(folder: Path, size: int) -> list[bytes]:
-    return as_json({"pid": 9, "host": "h", "command": "sagesplat run" * size, "since": "2026"})
-
-
 READERS = (
-    Reader("json", ".json", _json, file("m.json", read_json)),
+    Reader("json", ".json", documents(lambda n: {"a": [1, "x", None, 1.5] * n}, lambda n: [[], {}]),
+           file("m.json", read_json)),
     Reader("models", ".json", _models, file("models.json", eq3.read_models)),
     Reader("promises", ".json", _promises, file("promises.json", viewpoint.read_promises)),
     Reader("viewpoints", ".json", _viewpoints, file("viewpoints.json", viewpoints.read_viewpoints), 100),
     Reader("bundle-levels", ".json", _bundled, file("manifest.json", lambda p: levels_of(p.parent)), 100),
     Reader("camera-files", ".json", _camera_files, file("c.json", read_camera_file), 100),
-    Reader("cameras", ".json", _cameras, file("path.json", _read_cameras), 100),
+    Reader("cameras", ".json", _cameras,
+           file("path.json", lambda p: viewpoints.read_cameras(p, CAMERA)), 100),
     Reader("refined", ".npz", _refined, file("cameras.npz", _read_refined), 1000),
-    Reader("sky", ".npz", _sky, file("sky.npz", read_sky), 1000),
-    Reader("refined-figures", ".json", _figures, file("refined.json", read_refined_figures), 3000),
-    Reader("floaters", ".json", _floaters, file("floaters.json", read_clean_figures), 3000),
-    Reader("sampled", ".npz", _sampled, file("fidelity.npz", fidelity.read_sampled), 1000),
+    Reader("sky", ".npz", written_by("s.npz", _write_sky), file("sky.npz", read_sky), 1000),
+    Reader("refined-figures", ".json", noted(FIGURES), file("refined.json", read_refined_figures), 3000),
+    Reader("floaters", ".json", noted(FLOATERS), file("floaters.json", read_clean_figures), 3000),
+    Reader("sampled", ".npz", written_by("f.npz", _write_sampled),
+           file("fidelity.npz", fidelity.read_sampled), 1000),
     Reader("plans", ".json", _plans, file("plan.json", _read_plans), 100),
     Reader("observations", ".csv", _table(Observations), file("o.csv", read_observations), 1000),
     Reader("evaluation", ".csv", _table(Evaluation), file("e.csv", read_evaluation), 1000),
     Reader("cross-view", ".csv", _table(CrossView), file("c.csv", read_cross_view), 1000),
     Reader("same-size", ".csv", _table(SameSize), file("s.csv", read_same_size), 1000),
-    Reader("partition", ".json", _partition, file("b.json", _read_partition), 10_000),
+    Reader("partition", ".json", written_by("b.json", _write_partition),
+           file("b.json", _read_partition), 10_000),
     Reader("sweep", ".toml", _sweep, file("s.toml", read_sweep), 300, 16 * MIB),
-    Reader("comparison", ".json", _comparison, file("compare.json", read_comparison)),
+    Reader("comparison", ".json", written_by("c.json", _write_comparison),
+           file("compare.json", read_comparison)),
     Reader("scene", ".json", _scenes, file("scene.json", _read_scene), 3000),
     Reader("scene-elsewhere", ".json", _scenes, file("scene.json", _read_elsewhere), 3000),
     Reader("provenance", ".json", _provenance, file("provenance/train.json", _read_provenance), 1000),
     Reader("provenance-shown", ".json", _provenance, file("provenance/scene.json", _read_shown), 1000),
     Reader("cap", ".json", _caps, file("cap.json", _read_cap), 3000),
-    Reader("options", ".json", _options, file("segmented/options.json", _read_options), 3000),
+    Reader("options", ".json", noted(OPTIONS),
+           file("segmented/options.json", lambda p: recorded_settings(RunDir(p.parents[1]))), 3000),
     Reader("manifest", ".json", _manifest, file("manifest.json", _read_manifest)),
-    Reader("begun", ".npz", _begun, file("checkpoint.npz", _read_begun)),
-    Reader("segmented", ".json", _taxonomies, file(".taxonomy.json", _read_taxonomy), 1000),
+    Reader("begun", ".npz", checkpoints, file("checkpoint.npz", _read_begun)),
+    Reader("segmented", ".json", documents(lambda n: {str(i): f"thing {i}" for i in range(n)}),
+           file(".taxonomy.json", lambda p: segmenters._begin(p.parent, Taxonomy({0: "thing 0"}), [])), 1000),
     Reader("photo-hashes", ".json", _hashes, file("photos.json", _read_hashes), 1000),
-    Reader("frozen", ".json", _frozen, file("frozen.json", read_frozen), 3000),
-    Reader("edits", ".json", _edits, file("edit.json", _read_edits), 10_000),
+    Reader("frozen", ".json", documents(lambda n: {str(label): 500 for label in range(2 * n)}),
+           file("frozen.json", read_frozen), 3000),
+    Reader("edits", ".json", documents(lambda n: {"table": [0, 7, -1, *range(n)], "labels": {"7": "sky"}}),
+           file("edit.json", lambda p: label.read_edit_table(p, Taxonomy({0: "sky", 2: "tree"}))), 10_000),
     Reader("label-edits", ".json", _label_edits, file("labels.edit.json", label_edits.read_edits), 1000),
-    Reader("parents", ".json", _parents, file("parents.json", read_parents), 3000),
-    Reader("edited", ".json", _edited, file("edited.json", _read_edited), 3000),
-    Reader("segmenting", ".json", _networks, file(".network.json", _read_network), 3000),
-    Reader("prompts", ".json", _scores, file(".prompts-0.json", read_scores), 3000),
-    Reader("live", ".json", _live, file("live.json", live_bundle.read_live), 3000),
-    Reader("lock", ".json", _lock, file("lock", lock._holder), 3000),
-)
+    Reader("parents", ".json",
+           written_by("p.json", lambda p, n: write_parents(p, {f"chair {i}": "chair" for i in range(n)})),
+           file("parents.json", read_parents), 3000),
+    Reader("edited", ".json", written_by("edited.json", _write_edited),
+           file("edited.json", lambda p: label_settings(RunDir(p.parent))), 3000),
+    Reader("segmenting", ".json", noted(NETWORK),
+           file(".network.json", lambda p: label._is(p, NETWORK)), 3000),
+    Reader("prompts", ".json",
+           documents(lambda n: {"best": {f"prompt {i}": 0.5 for i in range(n)}, "threshold": 0.3},
+               lambda n: {"best": []}),
+           file(".prompts-0.json", read_scores), 3000),
+    Reader("live", ".json",
+           documents(lambda n: {"of": {"level": "1.npz", "written": 9}, "kept": [["chunks/a.spz"] * n]}),
+           file("live.json", live_bundle.read_live), 3000),
+    Reader("lock", ".json",
+           documents(lambda n: {"pid": 9, "host": "h", "command": "sagesplat run" * n, "since": "2026"}),
+           file("lock", lock._holder), 3000),
+)  # fmt: skip

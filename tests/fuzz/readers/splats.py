@@ -88,7 +88,7 @@ def _read_index(path: Path) -> None:
             read_streams(path.parent, chunks)
 
 
-def _checkpoints(folder: Path, size: int) -> list[bytes]:
+def checkpoints(folder: Path, size: int) -> list[bytes]:
     state = initial_state(splats(3 * size), 0)
     state.queue, state.frozen = [1, 0], {2: 1}
     state.per_view = {"pose": ViewParameters.zeros(3, 6)}
@@ -154,7 +154,7 @@ READERS = (
     Reader("spz", ".spz", _spz, file("g.spz", read_spz), 10_000),
     Reader("stream", ".sgst", _streams, lambda folder, content: decode_stream(content), 10_000),
     Reader("chunks", ".json", _index, file("index.json", _read_index)),
-    Reader("checkpoint", ".npz", _checkpoints, file("c.npz", _read_checkpoint)),
+    Reader("checkpoint", ".npz", checkpoints, file("c.npz", _read_checkpoint)),
     Reader("level", ".npz", _levels, file("000007.npz", _read_level)),
     Reader("snapshots", ".npz", _levels, file("levels/000007.npz", _read_snapshots)),
     Reader("nested", ".npz", _nested, file("n.npz", _read_nested)),
