@@ -211,7 +211,8 @@ def _matrices(gaussians: Gaussians) -> list[np.ndarray]:
 
 def _gaussians(columns: np.ndarray, labels: np.ndarray) -> Gaussians:
     """Gaussians from float32 columns [P, N] in the order of `_properties`, without normals."""
-    rest = columns[6:-8].reshape(3, -1, columns.shape[1])  # [3, K, N]: all red, all green, all blue
+    bases = (len(columns) - 14) // 3
+    rest = columns[6:-8].reshape(3, bases, columns.shape[1])  # all red, all green, all blue
 
     def rows(part: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(part, -1, 0)))
