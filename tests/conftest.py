@@ -1,5 +1,6 @@
 """Small labelled Gaussians, cameras and a capture on disk that several tests share."""
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,11 @@ from sagesplat.stages.api import run_scene
 from sagesplat.stages.pipeline import run_all
 
 # a busy machine is no failure
-settings.register_profile("sagesplat", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "sagesplat",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
 settings.load_profile("sagesplat")
 
 LABELS = (-1, 3, 184)
@@ -256,6 +261,14 @@ def demo_run(tmp_path_factory: pytest.TempPathFactory) -> DemoRun:
         of_ladder = replace(config, ladder=ladder)
         run_scene(made.capture, made.path, of_ladder, on_event=events.append, backend="cpu", threads=1)
     return made
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 600.0) -> None:
+    """Return once a condition holds; however slow the machine is."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
 
 
 def damage(content: bytes, data: st.DataObject) -> bytes:

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
@@ -56,7 +56,7 @@ def columns_of(g: Gaussians) -> dict[str, np.ndarray]:
     return {**named, **axes, "opacity": g.logit_opacities.numpy()}
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40)
 @given(data=st.data(), count=st.integers(0, 9), bases=st.sampled_from([0, 3, 8, 15]))
 def test_read_back_bit_for_bit(tmp_path, data, count, bases):
     def floats(*shape: int) -> torch.Tensor:

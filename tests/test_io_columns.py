@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
@@ -11,7 +11,7 @@ from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.core.errors import DataError
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30)
 @given(data=st.data(), count=st.integers(0, 6))
 @pytest.mark.parametrize(("kind", "read"), [(Observations, read_observations), (Evaluation, read_evaluation)])
 def test_tables_read_back_identical(tmp_path, kind, read, data, count):

@@ -10,7 +10,8 @@ import pytest
 
 pytest.importorskip("starlette", reason="needs the extra `view`")
 pytest.importorskip("uvicorn", reason="needs the extra `view`")
-from test_viewer_server import MANIFEST, ask, viewing, wait_for, write_files
+from conftest import wait_for
+from test_viewer_server import MANIFEST, ask, viewing, write_files
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
 from sagesplat.run.records import FORMAT

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import orbit, random_gaussians
-from test_cli import call
 
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
@@ -164,13 +163,13 @@ def test_cameras_of_another_scene(files):
         measure([files / "full.ply", files / "third.ply"], files / "out", config, ignore)
 
 
-def test_the_command(files, monkeypatch, capsys):
+def test_the_command(files, monkeypatch, command):
     monkeypatch.chdir(files)
     weights = ["--lpips", "none", "--threads", "1"]
-    code, _ = call(monkeypatch, capsys, "measure", "full.ply", "nowhere.ply", *weights)
+    code, _ = command("measure", "full.ply", "nowhere.ply", *weights)
     assert code == 2
     words = ["full.ply", "third.ply", "same.ply", "--cameras", "views.json", *weights]
-    code, _ = call(monkeypatch, capsys, "measure", *words)
+    code, _ = command("measure", *words)
     assert code == 0
     assert (files / "measure" / "levels.csv").is_file()
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import damage, random_gaussians
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagesplat.core.errors import RunError
@@ -89,7 +89,6 @@ def test_what_cannot_be_resumed_is_one_line(tmp_path, name, array, version, says
 @settings(
     max_examples=100,
     derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(st.data())
 def test_damage_is_one_line_or_harmless(tmp_path, data):

@@ -23,7 +23,6 @@ from sagesplat.output.tables import MB, last_counts
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.display_names import titles
-from sagesplat.stages.compose import compose
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_target, scene_plan
 from sagesplat.stages.report_data import picture_panels
@@ -71,7 +70,7 @@ def result(run: Path, path: Path, column: int = 0) -> None:
     """A test view of a run: photo, full model, composed scene, categories with their names. PNG."""
     job = Job(RunDir(run), lambda event: None)
     plan = scene_plan(job, *main_target(job.run))
-    composed = compose(job, plan) if job.antialiased else read_ply(job.run.composed)
+    composed = job.ladder.compose(plan.levels) if job.antialiased else read_ply(job.run.composed)
     panel = picture_panels(job, composed)[column]
     sizes = method_of(job).bytes_to_send or {}
     full = sum(last_counts(sizes).values()) / MB

@@ -161,7 +161,7 @@ def prepare(asked: Asked, backend: Backend, end: float, folder: Path) -> Bench:
     source = asked.masks or asked.scene / "masks"
     try:
         import_masks(scene, source, folder)
-        masks = Masks(folder, Taxonomy.read(folder / "labels.json"), 2**32)
+        masks = Masks(folder, Taxonomy.read(folder / "labels.json"))
         labels = lift(scene, masks).label_ids
     except SageError as error:
         print(f"no categories: {error}")
