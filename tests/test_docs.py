@@ -36,8 +36,8 @@ FOREIGN = {  # flags of other tools: pip and uv, ruff, Ray, splat-transform, Ope
     *("--fix", "--address", "--generate", "--head", "--scale", "--decimate"),
     *("--densify-until", "--no-masks", "--flag", "--no-flag"),
 }
-FOREIGN_FILES = {  # a placeholder; gsplat's, instant-ngp's
-    *("stages/NAME.py", "simple_trainer.py", "docs/nerf_dataset_tips.md")
+FOREIGN_FILES = {  # placeholders; gsplat's, instant-ngp's
+    *("stages/NAME.py", "docs/a.md", "simple_trainer.py", "docs/nerf_dataset_tips.md")
 }
 PLACEHOLDER = re.compile(r"…|\.\.\.|\bK\b")  # lines that leave something out, or stand for several
 
