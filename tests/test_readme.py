@@ -1,10 +1,18 @@
-"""What the README says can be typed: every line of its code blocks is parsed, and run where that is quick."""
+"""What the README says can be typed: every line of its code blocks is parsed, and run where that is quick.
 
+`pytest -m slow tests/test_readme.py` runs them all, in a checkout and an environment of their own.
+"""
+
+import os
 import re
 import shlex
 import shutil
+import signal
+import subprocess
 import sys
+import time
 import tomllib
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +20,7 @@ import pytest
 
 from sagesplat import cli, read_spz
 from sagesplat.cli.parse import arguments
+from sagesplat.demo.capture import make_capture
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -74,7 +83,7 @@ def test_the_snippet_runs(finished_run, tmp_path, monkeypatch) -> None:
     exec(compile(SNIPPET, "README.md", "exec"), names)
     image = np.asarray(names["image"])
     camera = names["camera"]
-    assert image.shape == (camera.height, camera.width, 3)  # type: ignore
+    assert image.shape == (camera.height, camera.width, 3)  # type: ignore[attr-defined]
     assert np.isfinite(image).all()
     assert image.std() > 0
 
@@ -85,3 +94,59 @@ def test_a_run_has_what_the_readme_says(finished_run) -> None:
     assert len(names) >= 4
     for name in names:
         assert (finished_run / name).exists(), name
+
+
+@pytest.mark.slow
+def test_everything_as_typed(tmp_path: Path) -> None:
+    """A quarter of an hour on two cores; needs a package index."""
+    checkout = tmp_path / "sagesplat"
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    done = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True)
+    for name in filter(lambda name: (ROOT / name).is_file(), done.stdout.splitlines()):
+        (checkout / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, checkout / name)
+    make_capture(tmp_path / "capture", views=16, width=160, height=120)
+    shutil.copytree(tmp_path / "capture" / "images", checkout / "photos")
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
+    unwanted = {"PYTHONPATH", "VIRTUAL_ENV", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS"}
+    env = {name: value for name, value in os.environ.items() if name not in unwanted}
+    env["PATH"] = f"{tmp_path / 'venv' / 'bin'}{os.pathsep}{env['PATH']}"
+
+    def run(line: str) -> subprocess.CompletedProcess[str]:
+        print(line, flush=True)
+        return subprocess.run(
+            line, shell=True, cwd=checkout, env=env, capture_output=True, text=True, check=False
+        )
+
+    for line in LINES:
+        if words_of(line)[0] == "make":  # of which this test is a part
+            continue
+        if words_of(line)[1] == "view":
+            assert_it_serves(words_of(line), checkout, env)
+            continue
+        if words_of(line)[1] == "adopt":
+            shutil.copy(checkout / "runs/demo/nested/composed.ply", checkout / "scene.ply")
+        done = run(line)
+        if done.returncode and words_of(line)[:3] == ["sagesplat", "run", "photos"]:
+            assert "hf download" in done.stderr, done.stderr  # without a network: what to do is said
+            continue
+        assert done.returncode == 0, f"{line}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    (checkout / "snippet.py").write_text(SNIPPET)
+    done = run("python snippet.py")
+    assert done.returncode == 0, done.stderr
+
+
+def assert_it_serves(words: list[str], folder: Path, env: dict[str, str]) -> None:
+    """`sagesplat view` says where it is, answers there, and ends with Ctrl-C."""
+    env = env | {"BROWSER": "true", "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(words, cwd=folder, env=env, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout
+        end = time.monotonic() + 1800
+        url = None
+        while url is None and time.monotonic() < end:
+            url = re.search(r"http://[\w.:]+/", server.stdout.readline())
+        assert url
+        with urllib.request.urlopen(f"{url[0]}manifest.json") as answer:
+            assert b"sagesplat-bundle" in answer.read()
+        server.send_signal(signal.SIGINT)
+        server.wait(600)

@@ -107,6 +107,36 @@ def test_the_package_is_complete_and_stands_alone(packed: Path) -> None:
             assert (types.parent / f"{name}.d.ts").is_file(), f"{types.name}: {name}"
 
 
+def test_the_types_of_the_package_are_enough_for_a_strict_project(packed: Path, tmp_path: Path) -> None:
+    shutil.copytree(packed, tmp_path / "node_modules" / "sagesplat-viewer")
+    (tmp_path / "page.ts").write_text(
+        """import { createViewer, type Embed, type ViewerOptions } from "sagesplat-viewer";
+const options: ViewerOptions = { bundle: "garden/", quality: "fidelity", target: 0.9 };
+const viewer: Embed = await createViewer(document.body, options);
+const bytes: number = viewer.state().bytesShown;
+viewer.setPose({ ...viewer.pose(), fovY: bytes ? 1 : 0.5 });
+// @ts-expect-error: there is no such quality
+await createViewer(document.body, { bundle: "garden/", quality: "beauty" });
+"""
+    )
+    words = [
+        "--strict",
+        "--noEmit",
+        "--target",
+        "es2022",
+        "--module",
+        "esnext",
+        "--lib",
+        "es2022,dom,dom.iterable",
+    ]
+    tsc = WEB / "node_modules" / ".bin" / "tsc"
+    checked = subprocess.run(
+        [str(tsc), *words, "--moduleResolution", "bundler", "page.ts"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert checked.returncode == 0, checked.stdout
+
+
 PAGE = """<!doctype html><title>A page</title><link rel="icon" href="data:,">
 <p>Words</p><div id="one"></div><div id="two"></div>
 <script type="module" src="page.js"></script>"""
