@@ -262,3 +262,28 @@ def test_a_path_wants_positions_and_one_aim():
         along(np.array([GOOD["quality"]]), GOOD["cost"])
     with pytest.raises(RunError, match=r"give \[positions, labels, levels\]"):
         along(GOOD["quality"], GOOD["cost"], target=0.5)
+
+
+@quick
+@given(problems(), st.lists(st.floats(0, 1.1), min_size=2, max_size=6))
+def test_more_budget_gives_no_less(problem, shares):
+    quality, cost, weight = problem
+    most = np.where(np.isfinite(cost), cost, 0).max(1).sum()
+    plans = [best_within(quality, cost, weight, max(1.0, share * most)) for share in sorted(shares)]
+    values = [plan.value for plan in plans if plan.status == "ok"]
+    assert (np.diff(values) >= -1e-10 * weight.sum()).all()
+
+
+@pytest.mark.parametrize("mode", [{"target": 0.8}, {"budget": 400_000.0}])
+def test_a_path_is_one_plan_after_another(mode):
+    quality, cost, weight = make_plans.scene(np.random.default_rng(1), 25, 6, 8)
+    weights = weight * np.random.default_rng(2).uniform(0, 2, (25, 6))
+    plan = along(quality, cost, weight=weights, **mode)
+    levels = None
+    for p in range(25):
+        if "target" in mode:
+            levels = cheapest(quality[p], cost, mode["target"], previous=levels).levels
+        else:
+            levels = best_within(quality[p], cost, weights[p], mode["budget"], previous=levels).levels
+        assert plan[p].tolist() == levels.tolist()
+    assert len(np.unique(plan, axis=0)) > 2

@@ -12,6 +12,7 @@ from sagesplat.metrics.image import (
     photometric_loss,
     psnr,
     squared_error_map,
+    ssim_map,
 )
 
 
@@ -105,3 +106,15 @@ def test_means_over_valid_pixels():
     label_ids, valid = np.array([[3, 3, -1], [3, -1, -1]]), np.array([[1, 0, 1], [1, 0, 0]], bool)
     assert means_by_label(values, label_ids, valid) == {-1: (2.0, 1), 3: (1.5, 2)}
     assert means_by_label(values, label_ids, np.zeros_like(valid)) == {}
+
+
+def test_the_map_is_of_the_whole_image_and_not_of_a_cut_out():
+    """The mean over a label sees the pixels around it, as the method asks."""
+    rng = np.random.default_rng(0)
+    x, y = rng.random((2, 30, 40, 3)).astype(np.float32)
+    label_ids = np.zeros((30, 40), np.int16)
+    label_ids[10:20, 10:30] = 7
+    mean, count = means_by_label(ssim_map(x, y), label_ids)[7]
+    assert count == 200
+    cut = np.where((label_ids == 7)[..., None], x, 0), np.where((label_ids == 7)[..., None], y, 0)
+    assert abs(means_by_label(ssim_map(*cut), label_ids)[7][0] - mean) > 1e-3

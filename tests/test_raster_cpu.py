@@ -150,3 +150,14 @@ def test_the_pose_changes_no_other_gradient():
         assert torch.equal(with_pose[name], grad), name
     everything = render_with_gradients(g, pinhole(), pose=True)[1]["pose"]
     assert torch.equal(moved, everything)  # Gaussians that are not trainable show where the camera is, too
+
+
+def test_the_order_of_the_rows_does_not_matter():
+    g, camera = random_gaussians(400, seed=7, degree=2), pinhole(90, 70)
+    order = torch.randperm(400, generator=torch.Generator().manual_seed(2))
+    render, grads = render_with_gradients(g, camera)
+    shuffled, shuffled_grads = render_with_gradients(g.select(order), camera)
+    assert (render.rgb - shuffled.rgb).abs().max() < 1e-6
+    assert torch.equal(render.radii[order], shuffled.radii)
+    for name, grad in grads.items():
+        assert (grad[order] - shuffled_grads[name]).abs().max() <= 1e-6 * grad.abs().max(), name

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from sagesplat.core.errors import SceneError
 from sagesplat.scene import describe, load_scene
 from sagesplat.scene.colmap import load_colmap
+from sagesplat.scene.colmap_read import read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Lens
 from sagesplat.scene.undistort import distort
@@ -198,3 +199,22 @@ def test_photos_that_cannot_be_named_are_one_line(tmp_path, name, text):
     with pytest.raises(SceneError, match=BAD_NAMES[name]) as raised:
         load_scene(tmp_path)
     assert str(raised.value).isprintable()
+
+
+def test_binary_and_text_models_are_the_same(tmp_path):
+    capture(tmp_path / "bin", [PINHOLE])
+    capture(tmp_path / "txt", [PINHOLE], text=True)
+    models = [read_model(tmp_path / kind / "sparse" / "0") for kind in ("bin", "txt")]
+    (cameras, images, points), (cameras2, images2, points2) = models
+    assert cameras[7].params == cameras2[7].params
+    assert all(np.array_equal(a, b) for a, b in zip(points, points2, strict=True))
+    for a, b in zip(images, images2, strict=True):
+        assert (a.id, a.name, a.camera_id) == (b.id, b.name, b.camera_id)
+        assert all(np.array_equal(getattr(a, f), getattr(b, f)) for f in ("w2c", "uv", "point_rows"))
+
+
+def test_rigs_and_frames_of_new_versions_are_left_alone(tmp_path):
+    capture(tmp_path, [PINHOLE])
+    for name in ("rigs.bin", "frames.bin"):
+        (tmp_path / "sparse/0" / name).write_bytes(b"\xff" * 24)
+    assert len(load_colmap(tmp_path).views) == 5

@@ -197,3 +197,13 @@ def test_room_of_stopped_categories_is_not_given_away():
     assert densify.room(state, 180, everything) == 40  # what was withheld stays so
     assert densify.room(state, 90, everything) == 0
     assert state.withheld == 40
+
+
+@pytest.mark.parametrize("steps", [1, 30, 300, 3000, 7000, 60_000])
+def test_schedule_scales_with_the_length(steps):
+    plan = schedule_of(TrainConfig(max_steps=steps, lr_schedule="published"))
+    assert plan.level_every == -(-steps // 30)
+    assert plan.refine_stop == max(1, steps // 2)
+    assert plan.reset_every == max(1500, steps // 10)  # a model needs time to come back
+    assert plan.recovery <= plan.reset_every // 2
+    assert schedule_of(TrainConfig(max_steps=steps, level_every=17)).level_every == 17

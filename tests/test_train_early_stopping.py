@@ -14,17 +14,19 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.demo.capture import make_capture
+from sagesplat.raster import rasterize
 from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.segment.lift import lift
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Masks, Taxonomy
-from sagesplat.train import schedule, trainer
+from sagesplat.train import schedule, stepper, trainer
 from sagesplat.train.early_stopping import (
     ActiveTiles,
     active_tiles,
     label_quality,
     measured_views,
+    trainable_rows,
 )
 from sagesplat.train.events import LabelFrozen, Resumed, Step, Trained
 from sagesplat.train.lr_schedule import smaller
@@ -212,3 +214,70 @@ def test_rare_categories_are_measured_where_they_show(capture):
     assert len(picked[9]) >= 8
     assert min(picked[9]) > 30
     assert all(set(rows) <= set(many.train_ids.tolist()) for rows in picked.values())
+
+
+def test_a_category_stops_at_the_first_level_that_reaches_the_target(capture, levels, tmp_path):
+    scene, photos, masks, labels = capture
+    config = replace(CONFIG, freeze_at=0.45, max_steps=40)
+    events = list(train(scene, photos, labels, config, masks=masks, folder=tmp_path))
+    first = min(e.step for e in events if isinstance(e, LabelFrozen))
+    for step in sorted(levels):
+        degree = min(3, step // round(1000 * 40 / 30_000))
+        quality = measured(levels[step], capture, degree)
+        reached = {
+            label for label, ssim in quality.items() if ssim >= 0.45 and label in levels[step].counts()
+        }
+        if step < first:
+            assert not reached
+        if step == first:
+            assert reached == {e.label_id for e in events if isinstance(e, LabelFrozen) and e.step == first}
+            break
+
+
+def test_rows_that_may_change(capture):
+    g = Gaussians(
+        *[torch.zeros(4, *shape) for shape in ((3,), (4,), (3,), (), (1, 3), (0, 3))],
+        label_ids=torch.tensor([-1, 3, 184, 3], dtype=torch.int16),
+    )
+    assert trainable_rows(g, {}).tolist() == [True] * 4
+    assert trainable_rows(g, {3: 100, 7: 5}).tolist() == [True, False, True, False]
+    assert trainable_rows(g, {-1: 1}).tolist() == [False, True, True, True]
+
+
+def test_tiles_with_only_stopped_categories_are_done():
+    labels = np.zeros((40, 50), np.int16)
+    labels[:, 30:] = 3
+    labels[39, 49] = -1
+    left, both = [True, True, False, False], [True, True, False, True]
+    assert active_tiles(labels, {3}).tolist() == [left, left, both]
+    assert active_tiles(labels, {3, -1}).tolist() == [left] * 3
+    assert active_tiles(labels, {0, 3}).tolist() == [[False] * 4] * 2 + [[False, False, False, True]]
+    assert not active_tiles(labels, {-1, 0, 3}).any()
+    assert active_tiles(labels, ()).all()
+    # the image 20 x 25 has 2 x 2 tiles, the right ones from column 32 on
+    assert active_tiles(labels, {3}, 2).tolist() == [[True, False], [True, True]]
+    assert active_tiles(labels, {3}, 4).tolist() == [[True]]
+
+
+def test_stopped_categories_stop_costing(capture, monkeypatch):
+    """What is drawn shrinks with every category that stops, and frozen rows take no gradient."""
+    scene, photos, masks, labels = capture
+    drawn: list[tuple[int, float]] = []
+
+    def watched(*args, **options):
+        tiles = options["tile_mask"]
+        drawn.append((int(options["trainable"] is not None), 1.0 if tiles is None else float(tiles.mean())))
+        return rasterize(*args, **options)
+
+    monkeypatch.setattr(stepper, "rasterize", watched)
+    frozen_at: list[int] = []
+    config = replace(CONFIG, freeze_at=0.44)
+    for event in train(scene, photos, labels, config, masks=masks):
+        if isinstance(event, LabelFrozen):
+            frozen_at.append(event.step)
+    first, last = min(frozen_at), max(step for step in frozen_at if step < config.max_steps)
+    assert set(drawn[:first]) == {(0, 1.0)}
+    before = np.mean([share for _, share in drawn[first:last]])
+    after = np.mean([share for _, share in drawn[last:]])
+    assert after < before < 1
+    assert all(asked for asked, _ in drawn[first:])  # for no gradients of frozen rows

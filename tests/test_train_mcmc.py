@@ -6,18 +6,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import random_gaussians
+from conftest import pinhole, random_gaussians, write_capture
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
-from sagesplat.raster import set_threads
+from sagesplat.raster import rasterize, set_threads
 from sagesplat.raster.reference import rotation_matrices
+from sagesplat.scene.images import Photos
 from sagesplat.train import mcmc
 from sagesplat.train.densify import PRUNE_OPACITY
-from sagesplat.train.early_stopping import trainable_rows
-from sagesplat.train.state import TrainState, initial_state
+from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
+from sagesplat.train.lr_schedule import LrSchedule
+from sagesplat.train.photo_loader import PhotoLoader
+from sagesplat.train.state import TrainState, from_points, initial_state
+from sagesplat.train.stepper import Stepper
+from sagesplat.train.strategy import make_strategy
 
 DEAD = -9.0  # a logit
 
@@ -278,3 +284,79 @@ def test_regularisers_have_the_gradients_that_autograd_finds():
 
 
 # ---- a small training
+
+
+@pytest.mark.parametrize(("logit", "moved", "tolerance"), [(-1.0, 3, 0.02), (0.5, 1, 0.02), (2.0, 4, 0.07)])
+def test_a_pile_renders_like_the_one_it_was(logit, moved, tolerance):
+    g = random_gaussians(moved + 1, degree=0, log_scale=-1.2)
+    g = replace(
+        g,
+        logit_opacities=torch.tensor([logit] + [DEAD] * moved),
+        means=torch.tensor([0.1, 0.2, 4.0]) + torch.arange(moved + 1)[:, None],
+        sh0=torch.ones_like(g.sh0),
+    )
+    state = state_of(g)
+    camera = pinhole()
+    before = rasterize(state.gaussians, camera).alpha.clone()
+    assert mcmc.relocate(state, all_of(state)) == moved
+    after = rasterize(state.gaussians, camera).alpha
+    assert float(before.max()) > 0.2
+    assert float((after - before).abs().max()) < tolerance
+    at = int(before.argmax())  # the centre is conserved exactly, up to where pixels and the low-pass lie
+    assert float(after.flatten()[at]) == pytest.approx(float(before.flatten()[at]), abs=0.01)
+    assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.15)
+
+
+def test_chance_comes_from_the_state_alone():
+    def run(seed: int) -> TrainState:
+        state = state_of(random_gaussians(300, logit=-4), seed)
+        for _ in range(3):
+            mcmc.relocate(state, all_of(state))
+            mcmc.add(state, 1000, all_of(state))
+            mcmc.perturb(state, 0.1, all_of(state))
+        return state
+
+    first, again, other = (snapshot(run(seed)) for seed in (1, 1, 2))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["means"], other["means"])
+
+
+def test_opaque_ones_hardly_move():
+    moved = {}
+    for opacity in (0.001, 0.005, 0.05, 0.15, 0.19, 0.5):
+        state = state_of(one_shape(1000, math.log(opacity / (1 - opacity))))
+        mcmc.perturb(state, 1.0, all_of(state))
+        moved[opacity] = float(state.gaussians.means.norm(dim=1).mean())
+    assert moved[0.001] / moved[0.005] == pytest.approx(2 / (1 + math.exp(-0.4)), rel=1e-3)
+    assert list(moved.values()) == sorted(moved.values(), reverse=True)
+    assert moved[0.19] < 1e-7 * moved[0.005]
+    assert moved[0.5] == 0
+
+
+def test_a_chain_learns(tmp_path):
+    truth = random_gaussians(60, seed=12, degree=0, log_scale=-1.6, logit=1.0)
+    scene = write_capture(tmp_path / "cloud", truth)
+    config = TrainConfig(max_steps=105, sh_degree=0, strategy="mcmc")
+    labels = np.array([-1, 3, 184], np.int16)[np.arange(60) % 3]
+    state = initial_state(from_points(scene.points, labels, 0), seed=0)
+    feed = PhotoLoader(scene, Photos(scene.views), torch.device("cpu"))
+    rates = LrSchedule(config, scene.extent)
+    strategy = make_strategy(config, scene, rates)
+    stepper = Stepper(feed, config, ActiveTiles(scene, None), strategy=strategy)
+    losses, kept = [], torch.empty(0)
+    trainable = all_of(state)
+    for step in range(1, 106):
+        if step == 42:  # one category stops
+            state.frozen = {3: step}
+            trainable = trainable_rows(state.gaussians, state.frozen)
+            kept = state.gaussians.of_labels([3]).means.sort(0).values
+        losses.append(float(stepper(state, 0, rates.learning_rates(step), trainable)))
+        if 14 <= step < 90 and step % 7 == 0:
+            mcmc.relocate(state, trainable)
+            mcmc.add(state, 90, trainable)
+            state.sort()
+            trainable = trainable_rows(state.gaussians, state.frozen)
+    assert np.mean(losses[-7:]) < 0.65 * np.mean(losses[:7])
+    assert 80 < len(state.gaussians) <= 90 - state.withheld
+    assert state.withheld > 0
+    assert torch.equal(state.gaussians.of_labels([3]).means.sort(0).values, kept)
