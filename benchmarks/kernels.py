@@ -186,7 +186,7 @@ def blending(g: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
     backward = milliseconds(
         lambda: blend.backward(
             records, radii, found.starts, ends, found.ids, found.slots, found.row_order, camera.width,
-            image, left, grad, none, reached, sums, None,
+            image, left, grad, none, reached, sums,
         ),
         repeats, best=True,
     )  # fmt: skip

@@ -180,7 +180,7 @@ def test_a_phone_has_room_for_all_of_it(bundle: Path, browser: Any) -> None:
         page = opened.page
         page.get_by_label("Edit labels (L)").tap()
         page.touchscreen.tap(180, 150)
-        opened.wait_for("!document.querySelector('.picked').textContent.startsWith('Click')")
+        opened.wait_for("document.querySelector('.editor button')")
         boxes = [
             one.bounding_box() for one in page.locator(".editor :is(button, select, .field):visible").all()
         ]

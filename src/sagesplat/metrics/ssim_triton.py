@@ -1,4 +1,4 @@
-"""The training loss and SSIM on a GPU, in Triton: the mathematics of `ssim.py` and `metrics.py`.
+"""The training loss and SSIM on a GPU, in Triton: the mathematics of `ssim_cpu.py` and `image.py`.
 
 An image [H, W, 3] is a matrix [H, 3 W] whose neighbouring pixels are three columns apart. The window is
 separable: every kernel blurs along one axis. A program works on a tile of 16x16 pixels. There are no atomics,

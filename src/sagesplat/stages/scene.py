@@ -83,8 +83,7 @@ def open_scene(
         check_photos(scene, begun.photos, photos.sha256)
 
     def make() -> list[str]:
-        _write_geometry(run.geometry, scene)
-        write_json(
+        write_json(  # first: without it the folder would be none of a run
             run.scene,
             {
                 "path": str(path.resolve()),
@@ -107,6 +106,7 @@ def open_scene(
                 ],
             },
         )
+        _write_geometry(run.geometry, scene)
         size = scene.views[0].camera
         lines = [
             f"{len(scene.train_ids)} training, {len(scene.test_ids)} test views, {size.width}x{size.height}",
