@@ -400,7 +400,6 @@ def test_it_goes_on_offline(viewer: Opened) -> None:
 # the page
 
 
-@pytest.mark.slow
 def test_the_keyboard_is_enough(site: str, browser: Any) -> None:
     with open_page(site, browser=browser) as opened:
         ready(opened)

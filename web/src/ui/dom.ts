@@ -60,7 +60,7 @@ export const textButton = (
 
 /** Whether an event goes to something that takes keys itself. */
 export const isTyping = ({ target }: Event): boolean =>
-  target instanceof HTMLElement && target.closest("input, select, textarea, dialog") !== null;
+  target instanceof HTMLElement && target.closest("input, select, textarea, dialog[open]") !== null;
 
 /** A button with an icon; its title is the tooltip and the accessible name. */
 export function iconButton(
