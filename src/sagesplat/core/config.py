@@ -8,9 +8,9 @@ from msgspec import Meta
 
 from sagesplat.core.limits import NotNegative, Seed, Share, SomeShare
 
-MOST = 2**31 - 1  # steps, views, pixels
-Count = Annotated[int, Meta(ge=0, le=MOST)]
-AtLeast1 = Annotated[int, Meta(ge=1, le=MOST)]
+_MOST = 2**31 - 1
+Int31 = Annotated[int, Meta(ge=0, le=_MOST)]  # steps, views, pixels
+PositiveInt31 = Annotated[int, Meta(ge=1, le=_MOST)]
 Downscale = Annotated[int, Meta(ge=0, le=1024)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
 Side = Annotated[int, Meta(ge=1, le=4096)]  # pixels
@@ -29,9 +29,9 @@ class SceneConfig:
     downscale: Downscale = 0
     """Downscaling factor of the photos that are trained on; 0: 1, but on a CPU 2, 4 or 8 where photos have
     more than 1.25 megapixels. images_N is read where the capture has it."""
-    test_every: Count = 8
+    test_every: Int31 = 8
     """Every n-th view by name is a test view, used for evaluation only; 0: none."""
-    calibrate_every: Count = 8
+    calibrate_every: Int31 = 8
     """Every n-th of the other views is held out of training, to calibrate the quality models; 0: none."""
     alpha: Literal["auto", "background", "ignore"] = "auto"
     """Transparent pixels of photos. background: an object that was cut out, composited over the background;
@@ -54,9 +54,9 @@ class PosesConfig:
     """Camera model of COLMAP."""
     refine_principal_point: bool = False
     """Estimate the principal point too, for photos that were cropped one by one."""
-    max_size: Annotated[int, Meta(ge=64, le=MOST)] = 3200
+    max_size: Annotated[int, Meta(ge=64, le=_MOST)] = 3200
     """Longer side of the photos for feature extraction, and of the undistorted photos, pixels."""
-    max_frames: AtLeast1 = 300
+    max_frames: PositiveInt31 = 300
     """Frames that are taken from a video."""
     min_registered: Share = 0.5
     """Fraction of the photos that must get a pose."""
@@ -140,15 +140,15 @@ class TrainConfig:
     strategy: Literal["default", "mcmc"] = "default"
     """Densification. default: clone, split, prune and reset as 3DGS; mcmc: relocation and noise as
     3DGS-MCMC."""
-    refine_every: AtLeast1 = 100
+    refine_every: PositiveInt31 = 100
     """Steps between two densifications, not scaled: the gradient statistics need the views."""
-    refine_start: Count = 500
+    refine_start: Int31 = 500
     """First step of densification, not scaled, at most a fifth of the training."""
-    refine_stop: Count = 15_000
+    refine_stop: Int31 = 15_000
     """Last step of densification."""
     grow_grad: NotNegative = 2e-4
     """Clone or split Gaussians whose mean screen-space gradient (in half image widths) is above this."""
-    max_gaussians: Count = 0
+    max_gaussians: Int31 = 0
     """Maximum number of Gaussians; the limit grows linearly during densification (0: choose from the image
     size)."""
     poses: bool = False
@@ -181,7 +181,7 @@ class BlocksConfig:
     count: Annotated[int, Meta(ge=1, le=4096)] = 1
     """Ground-plane blocks that are trained independently and merged; 1: no blocks. The --train options hold
     for each block."""
-    boundary_steps: Count = 300
+    boundary_steps: Int31 = 300
     """Boundary tuning: training steps on the Gaussians near the border of each block, after merging."""
 
 
@@ -189,7 +189,7 @@ class BlocksConfig:
 class NestConfig:
     """Nested levels: prefixes of one ordered model."""
 
-    steps: Count = 2400
+    steps: Int31 = 2400
     """Training steps on random compositions of levels."""
     levels: Annotated[int, Meta(ge=1, le=64)] = 16
     """Levels per category; their sizes grow geometrically."""
@@ -198,7 +198,7 @@ class NestConfig:
     base_share: BelowOne = 0.2
     """Size of the base model, as a fraction of all Gaussians; it is a small 3DGS-MCMC model that forms the
     lowest levels; 0: none."""
-    base_steps: AtLeast1 = 1600
+    base_steps: PositiveInt31 = 1600
     """Training steps of the base model, which begins with the trained model, merged to that size."""
     full_share: Share = 0.1
     """Fraction of the first steps that sample the full model; rises linearly to 90 % of the last ones."""
@@ -214,7 +214,7 @@ class AdoptConfig:
     fit: Literal["renders", "none"] = "renders"
     """Lower levels. renders: merged Gaussians, trained on the splat's own renders; none: merged Gaussians,
     without training."""
-    steps: Count = 3000
+    steps: Int31 = 3000
     """Training steps on compositions of the lower levels."""
     shares: LevelShares = (0.004, 0.008, 0.016, 0.031, 0.0625, 0.125, 0.25, 0.5, 0.7, 1.0)
     """Sizes of the levels, as fractions of all Gaussians; categories that lose less keep fewer. Levels of
@@ -255,7 +255,7 @@ class SampleConfig:
     viewpoints: Path | None = None
     """File with the cameras to draw from: a viewpoints.json, or a transforms.json (default: the cameras of
     the training and calibration photos)."""
-    neighbours: Count = 4
+    neighbours: Int31 = 4
     """Each viewpoint lies between a camera and one of this many nearest ones; 0: at a camera."""
     shift: Share = 0.03
     """Largest random shift along each axis, as a fraction of the scene extent."""
@@ -333,7 +333,7 @@ class PaperConfig:
     """Photo of Tables III and IV and of Fig. 4 (default: the middle one of the test views)."""
     lpips: Path | None = None
     """Folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)."""
-    tune_steps: Count = 500
+    tune_steps: Int31 = 500
     """Training steps of pruned 3DGS and of tuned compositions in Table IV."""
 
 
@@ -343,11 +343,11 @@ class CompareConfig:
 
     targets: tuple[SomeShare, ...] = ()
     """SSIM targets for SAGE compositions (default: 0.6 0.7 0.8 and the targets of the run)."""
-    snapshots: AtLeast1 = 10
+    snapshots: PositiveInt31 = 10
     """Maximum number of training snapshots to compare, evenly spaced in size."""
     shares: tuple[SomeShare, ...] = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
     """Sizes that the last snapshot is pruned to, as fractions of its Gaussians."""
-    tune_steps: Annotated[int, Meta(ge=-1, le=MOST)] = 500
+    tune_steps: Annotated[int, Meta(ge=-1, le=_MOST)] = 500
     """Training steps after pruning; -1: as many as the nested levels had."""
     caps: tuple[SomeShare, ...] = (0.1, 0.2, 0.35, 0.5, 1.0)
     """Sizes of 3DGS-MCMC models, trained from the start, as fractions of the last snapshot's Gaussians."""

@@ -38,10 +38,22 @@ def run_stage(
     """Do a stage, unless its result is there already: made with the same settings from the same inputs.
 
     The run folder is locked meanwhile. A stage counts as done only once its files are on the disk, and not
-    while it is redone. `make` does the work and returns lines that sum it up; for the rest see `Stage`.
+    while it is redone.
 
-    RunError where an input is missing, the result was made with other settings (without `job.force`), another
-    process works on the folder, or the disk is full; OutOfMemory. The same command then resumes.
+    Args:
+        job: The run folder, and where events go.
+        name: Of the stage in `STAGES`; its record is provenance/NAME.json.
+        settings: Everything that the result depends on, besides the inputs; JSON.
+        inputs: Files and folders that it is made from; their hashes are recorded.
+        outputs: Files and folders that it makes.
+        make: Does the work and returns lines that sum up the result.
+        swaps: The old result and its record stay until `make` removes them.
+
+    Raises:
+        RunError: If an input is missing, the result was made with other settings (without `job.force`),
+            another process works on the folder, or the disk is full. What was finished stays: the same
+            command resumes.
+        OutOfMemory: If memory runs out; the same holds.
     """
     run_stages(job, [Stage(name, settings, inputs, outputs, swaps)], lambda _: iter([(0, make())]))
 
