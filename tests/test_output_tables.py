@@ -182,7 +182,9 @@ def test_text_cells_come_back(text):
 
 
 def test_markdown_and_latex_take_names_as_they_are():
-    table = tables.Table("t", ("a|b",), ("",), [(name,) for name in (*AWKWARD, "<b>&amp;", "c_%")])
+    table = tables.Table(
+        "t", ("a|b",), ("",), [(name,) for name in (*AWKWARD, "<b>&amp;", "c_%", "≥ x^2 – 1")]
+    )
     lines = table.markdown().splitlines()
     assert lines[0] == "| a\\|b |"
     assert {
@@ -194,4 +196,6 @@ def test_markdown_and_latex_take_names_as_they_are():
         "| c\\_% |",
     } < set(lines)
     latex = table.latex().splitlines()
+    assert r"$<$b$>$\&amp; \\" in latex
+    assert r"$\geq$ x\textasciicircum{}2 -- 1 \\" in latex
     assert {r"{[}a](b) \\", r"{*}a \\", r"\_a\_ \\", r"c\_\% \\", r"a\textbackslash{} \\"} < set(latex)
