@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 from sagesplat.adapt.calibrate_photos import (
+    MULTIPLIERS,
     TARGETS,
     LeftOut,
+    _decisions,
+    _envelope,
     _inflation,
+    _multipliers,
+    _risks,
+    _Scored,
     _slope,
     calibrate_photos,
     with_changes,
@@ -146,3 +152,59 @@ def test_coverage_of_new_views_over_many_draws():
     assert some.sum() >= 8
     assert (kept[some] / accepted[some]).min() > 0.94
     assert (kept[some] / accepted[some]).mean() < 0.995  # and not by accepting nothing
+
+
+def test_decisions_and_risks_by_hand():
+    g = int(np.argmin(np.abs(TARGETS - 0.6)))
+    change, bias = np.zeros((2, len(TARGETS))), np.zeros(len(TARGETS))
+    change[1, g], bias[g] = 0.2, 0.03
+    score, measured = np.array([[0.5, 0.7], [0.4, 0.6]]), np.array([[0.65, 0.7], [0.3, 0.55]])
+    own = _Scored(score, measured, change, bias, 0.1, 0.0)
+    accepted, missed = _decisions(own, g)
+    for column, multiplier in enumerate(MULTIPLIERS):
+        threshold = 0.6 + multiplier * 0.1 - 0.03
+        for view in range(2):
+            level = next((k for k in range(2) if own.score[view, k] >= threshold), None)
+            got = np.nan if level is None else own.measured[view, level] + [0.0, 0.2][view]
+            assert accepted[view, column] == (level is not None)
+            assert missed[view, column] == (level is not None and got < 0.6)
+    risk = _risks(np.array([[4.0], [1.0], [0.0]]), np.array([[1.0], [1.0], [0.0]]), 1)
+    by_view, by_decision = (0.25 + 1 + 1) / (2 + 1), (2 + 2.5) / (5 + 2.5)
+    np.testing.assert_allclose(risk, [max(by_view, by_decision)])
+
+
+def test_a_target_that_no_threshold_keeps_is_left_out():
+    """Half of all views measure far less than predicted: no margin helps at the top."""
+    own = left_out(120, 30)
+    low = own.ssim - 0.5 * (np.arange(120) % 2)[:, None]
+    found = calibrate_photos({3: replace(own, ssim=low)}, 0.95)[3]
+    assert not len(found.targets) or found.targets[-1] < 0.4
+    good = calibrate_photos({3: own}, 0.95)[3]
+    assert 0.7 <= good.targets[-1] < 0.95  # the mean of the highest level is 0.9
+    assert good.thresholds[-1] <= own.mean.max()
+
+
+def test_a_multiplier_is_at_least_that_of_the_targets_beside_it():
+    views = {3: left_out(120, 30)}
+    none = views[3].change
+    scored = {3: _Scored(views[3].mean, views[3].ssim, none, none[0], 0.03, 0.0)}
+    found = _multipliers(views, scored, 0.95)
+    finite = np.flatnonzero(np.isfinite(found))
+    assert len(finite) >= 5
+    # what a target alone needs, by a grid of multipliers
+    for g in finite[1:-1]:
+        for beside in (g - 1, g, g + 1):
+            accepted, missed = _decisions(scored[3], int(beside))
+            at = np.argmin(np.abs(MULTIPLIERS - found[g]))
+            assert missed[:, at].sum() + 1 <= 0.05 * (accepted[:, at].sum() + 1) + 1e-9
+
+
+def test_a_higher_targets_threshold_keeps_a_lower_target_too():
+    none = np.zeros((1, len(TARGETS)))
+    own = _Scored(np.full((1, 1), 0.95), np.full((1, 1), 0.95), none, none[0], 0.1, 0.0)
+    multipliers = np.where(TARGETS < 0.5, 4.0, 0.5)
+    multipliers[-3:] = np.inf
+    targets, thresholds = _envelope(multipliers, own)
+    assert targets[-1] == TARGETS[-4]
+    assert (thresholds[:4] <= 0.5 + 0.05 + 1e-6).all()
+    assert (np.diff(thresholds) > 0).all()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from viewpoint_fields import LEVELS, orbit, synthetic
+from viewpoint_fields import LEVELS, orbit, synthetic, viewpoints
 
 from sagesplat.adapt.coverage import PREDICTORS, Decisions, decide, score
 from sagesplat.adapt.photo_models import fit_photo_models
@@ -77,3 +77,25 @@ def test_nothing_to_score(model):
     assert empty.totals()["accepted"] == 0
     with pytest.raises(RunError, match="target"):
         score(synthetic(SCENE, 1), SCENE, {5: model}, COSTS, [1.5])
+
+
+def test_score_by_hand(model):
+    observations = synthetic(SCENE, 1)
+    result = score(observations, SCENE, {5: model}, COSTS, [0.7], SCENE.calibration_ids)
+    totals = result.by("bound").totals()
+    measured = observations.ssim.reshape(-1, 4)[SCENE.calibration_ids].astype(np.float64)
+    bound = model.predict(*viewpoints(SCENE, SCENE.calibration_ids)).bound
+    accepted = (bound >= 0.7).any(1)
+    level = (bound >= 0.7).argmax(1)
+    got = measured[np.arange(len(level)), level]
+    kept = accepted & (got >= 0.7)
+    assert totals["decisions"] == len(level)
+    assert totals["accepted"] == accepted.sum()
+    assert totals["violated"] == (accepted & ~kept).sum()
+    assert totals["overshoot"] == pytest.approx(np.mean(got[accepted] - 0.7))
+    assert totals["false_rejections"] == (~accepted & (measured >= 0.7).any(1)).sum()
+    oracle = (measured >= 0.7).argmax(1)
+    assert totals["regret"] == pytest.approx(10 * np.mean((level - oracle)[kept]))
+    best = result.by("perfect").totals()
+    assert (best["coverage"], best["regret"], best["false_rejections"], best["violated"]) == (1, 0, 0, 0)
+    assert best["excess"] == best["perfect_excess"]

@@ -9,6 +9,7 @@ import pytest
 from sagesplat.adapt.fidelity import SampledFidelity, read_sampled, write_sampled
 from sagesplat.adapt.fidelity_models import (
     NOMINAL,
+    TARGETS,
     Trial,
     calibrated,
     fit_fidelity,
@@ -16,7 +17,7 @@ from sagesplat.adapt.fidelity_models import (
     plan_nominal,
     remove_composition_bias,
 )
-from sagesplat.adapt.viewpoint import read_promises, write_promises
+from sagesplat.adapt.viewpoint import Calibration, read_promises, write_promises
 from sagesplat.core.errors import DataError
 from sagesplat.scene.scene import Camera
 
@@ -220,3 +221,12 @@ def test_damaged_samples_are_one_line(tmp_path: Path, name, value):
         DataError, match=r"f\.npz: not a file of sampled fidelity .*run `sagesplat sample` again"
     ):
         read_sampled(tmp_path / "f.npz")
+
+
+def test_targets_between_those_that_are_calibrated():
+    thresholds = np.array([0.5, 0.5 + 1e-6, 0.8])
+    steps = Calibration("calibrated", 0.95, 30, np.array([0.4, 0.6, 0.7]), thresholds, 0.0)
+    found = steps.bound(np.array([[0.3, 0.5 - 1e-9, 0.5, 0.5 + 1e-6, 0.65, 0.9]]), np.ones(1))[0]
+    np.testing.assert_allclose(found, [0.2, 0.4, 0.4, 0.6, 0.65, 0.7], atol=1e-6)
+    assert (np.diff(TARGETS) > 0).all()
+    assert set(NOMINAL[NOMINAL < 0.9]) <= set(TARGETS)

@@ -10,6 +10,7 @@ from sagesplat.adapt.observe import (
     TOTAL,
     as_unit,
     distances_in_views,
+    erode,
     measure,
     widest_lens,
     within_lens,
@@ -88,3 +89,12 @@ def test_pixels_that_do_not_count_are_in_no_mean():
     assert rows[7]["psnr"] == pytest.approx(float(psnr(errors[:, 20:25].mean())))
     assert rows[3]["ssim"] == pytest.approx(measure(image, photo, label_ids)[3]["ssim"])
     assert np.isnan(measure(image, photo, label_ids, valid=np.zeros_like(valid))[TOTAL]["psnr"])
+
+
+def test_erode_keeps_pixels_that_are_far_from_any_border():
+    label_ids = np.full((40, 50), 3, np.int16)
+    label_ids[:, 25:] = 4
+    inner = erode(label_ids)
+    assert set(np.unique(inner[:, :20])) == {3}
+    assert set(np.unique(inner[:, 30:])) == {4}
+    assert not np.isin(inner[:, 20:30], (3, 4)).any()

@@ -105,6 +105,12 @@ def test_labels_with_hardly_any_data():
         assert np.isfinite([model.calibration.discount, *model.calibration.thresholds]).all()
     exact = models[5].predict(d, position, direction)
     assert np.nanmax(exact.bound) <= 0.7 + 1e-6
+    costs = {(label, level): level for label, model in models.items() for level in model.levels}
+    observations = together(*parts.values())
+    result = score(observations, SCENE, models, costs, [0.6])
+    assert set(result.label_id.tolist()) == set(models) - {1, 2, 6, -1}  # in no test view
+    planned = {key: cost for key, cost in costs.items() if key[0] != 5}  # no Gaussians of 5: in no plan
+    assert 5 not in score(observations, SCENE, models, planned, [0.6]).label_id
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 6])

@@ -120,13 +120,17 @@ def test_round_trip(tmp_path, model):
     "change",
     [
         {"heldout_variance": -1}, {"lengths": [1, 1]}, {"weights": [[1.0]]}, {"curves": []},
+        {"inputs": []}, {"extent": 0}, {"quality": "good"}, {"rmse": None}, {"calibration": {}},
         {"calibration": {"targets": [0.6, 0.6, 0.8]}}, {"calibration": {"thresholds": [0.1, 0.2, math.nan]}},
+        {"calibration": {"targets": [0.6, 0.7]}}, {"calibration": {"thresholds": [0.1, 0.2, 2]}},
+        {"calibration": {"confidence": 1}}, {"calibration": {"least_support": 2}},
+        {"calibration": {"discount": math.inf}},
     ],
 )  # fmt: skip
 def test_spoilt_files_are_one_line(tmp_path, model, change):
     entry = to_plain(model)
     if "calibration" in change:
-        change = {"calibration": entry["calibration"] | change["calibration"]}
+        change = {"calibration": change["calibration"] and entry["calibration"] | change["calibration"]}
     path = tmp_path / "promises.json"
     path.write_text(json.dumps({"promises": [entry | change]}))
     with pytest.raises(DataError, match="not a file of promises") as error:

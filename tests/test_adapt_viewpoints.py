@@ -100,7 +100,7 @@ def test_all_cameras_in_one_place_and_a_single_one():
     "rule", [Rule(neighbours=-1), Rule(shift=-0.1), Rule(shift=float("nan")), Rule(turn=4.0)]
 )
 def test_rules_that_cannot_be_followed(rule):
-    with pytest.raises(RunError, match="is impossible; choose a number from 0"):
+    with pytest.raises(RunError, match=r"--sample\.\w+ \S+ is impossible; choose a number from 0"):
         draw(SCENE, capture_cameras(SCENE), rule, {"fit": 1})
 
 

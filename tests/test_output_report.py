@@ -420,3 +420,55 @@ def test_awkward_names_are_drawn_and_listed_as_they_are(tmp_path: Path, first: i
     assert {cell_text(cell) for cell in cells} > set(some[1:])
     for drawing in (tmp_path / "report" / "figures").glob("*.svg"):
         ElementTree.parse(drawing)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_exposures_of_the_photos_are_said(written, tmp_path):
+    path, data, _ = written
+    assert "cc_psnr" not in path.read_text("utf-8").split("All numbers")[0]
+    more = dataclasses.replace(
+        data, exposed=True, noticed=("exposure varies by 0.8 EV", "3 floaters removed")
+    )
+    page = write_report(tmp_path, more).read_text("utf-8")
+    assert "Noticed in this capture, and dealt with: exposure varies by 0.8 EV; 3 floaters removed." in page
+    said = page.split("<h2>What each category gets</h2>")[1].split("<table>")[0]
+    assert "The photos differ in exposure" in said
+    assert "cc_ssim 0.750 and cc_psnr 0.75 dB" in said
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_categories_out_of_reach_are_named(tmp_path):
+    data = make(panels=0)
+    distances = {i: np.array([2.0]) for i in LABELS}
+    plan = plan_scene(data.models, data.counts, distances, 0.75)
+    out = [c.label_id for c in plan.choices if c.status == "infeasible"]
+    assert 0 < len(out) < len(LABELS)
+    data = dataclasses.replace(
+        data, plans=[plan], target=0.75, observations=data.observations.select(TEST[:0])
+    )
+    text = " ".join(Page(write_report(tmp_path, data)).text.split())
+    assert f"{len(out)} of {len(LABELS)} categories cannot reach 0.75" in text
+    assert text.count("infeasible") > len(out)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_an_address_is_a_qr_code_only_where_there_is_one(whole, tmp_path):
+    assert "QR code of" not in whole.read_text("utf-8")
+    data = dataclasses.replace(whole_page(), url="https://example.org/x/")
+    page = write_report(tmp_path, data).read_text("utf-8")
+    assert '<a href="https://example.org/x/">' in page
+    assert re.search(r'<img class="qr" src="data:image/svg\+xml[^"]{400,}" alt="QR code of https', page)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_pixels_that_are_ignored_are_grey_in_the_error_and_explained(written, tmp_path):
+    data, said = make(panels=1), "grey: ignored, and in none of these figures"
+    (panel,) = data.panels
+    valid = np.ones(panel.photo.shape[:2], bool)
+    valid[:5, :5] = False
+    error = figures.error_image(panel.composed, panel.photo, valid)
+    assert (error[valid] == figures.error_image(panel.composed, panel.photo)[valid]).all()
+    assert len(np.unique(error[~valid])) == 1
+    assert said not in written[2].text
+    data = dataclasses.replace(data, panels=[dataclasses.replace(panel, valid=valid)])
+    assert said in Page(write_report(tmp_path, data)).text

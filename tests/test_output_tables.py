@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sagesplat.adapt.eq3 import fit_model
 from sagesplat.adapt.evaluate import QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Plan, Reached
@@ -182,7 +183,9 @@ def test_text_cells_come_back(text):
 
 
 def test_markdown_and_latex_take_names_as_they_are():
-    table = tables.Table("t", ("a|b",), ("",), [(name,) for name in (*AWKWARD, "<b>&amp;", "c_%")])
+    table = tables.Table(
+        "t", ("a|b",), ("",), [(name,) for name in (*AWKWARD, "<b>&amp;", "c_%", "≥ x^2 – 1")]
+    )
     lines = table.markdown().splitlines()
     assert lines[0] == "| a\\|b |"
     assert {
@@ -194,4 +197,16 @@ def test_markdown_and_latex_take_names_as_they_are():
         "| c\\_% |",
     } < set(lines)
     latex = table.latex().splitlines()
+    assert r"$<$b$>$\&amp; \\" in latex
+    assert r"$\geq$ x\textasciicircum{}2 -- 1 \\" in latex
     assert {r"{[}a](b) \\", r"{*}a \\", r"\_a\_ \\", r"c\_\% \\", r"a\textbackslash{} \\"} < set(latex)
+
+
+def test_models_table(tmp_path):
+    distance = np.linspace(1, 5, 30, dtype=np.float32)
+    model = fit_model(3, 1000, distance, 0.8 * np.exp(-0.1 * distance))
+    row = as_text(tables.models_table({(3, 1000): model}, NAMES), tmp_path / "t.csv")[0]
+    assert row["category"] == "vase"
+    assert float(row["K1"]) == model.params.K1
+    assert (float(row["d min"]), float(row["d max"])) == (1, 5)
+    assert tables.models_table({}, NAMES).rows == []

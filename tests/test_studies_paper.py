@@ -319,7 +319,7 @@ def test_tables_in_markdown_and_latex(tmp_path):
     assert r"\caption{SSIM \& more}" in tex
     assert r"\multicolumn{2}{c}{t=5}" in tex
     assert r"\cmidrule(lr){2-3}" in tex
-    assert r"a\_b|c & \cellcolor{black!10}0.50\textsuperscript{t=0.5} & 1.4M & 50 \% \\" in tex
+    assert r"a\_b$|$c & \cellcolor{black!10}0.50\textsuperscript{t=0.5} & 1.4M & 50 \% \\" in tex
     assert tex.count(r"\\") == 4 + 0
     assert table.only("count", "category").cells() == [["1.4M", "a_b|c"], ["9,400", "d"]]
     table.write(tmp_path / "t")

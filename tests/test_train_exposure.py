@@ -109,3 +109,15 @@ def test_a_fit_to_a_photo_of_one_colour_is_finite(value):
     found = fit_exposure(image, np.full_like(image, value))
     assert np.isfinite(found).all()
     assert np.abs(found - np.eye(3, 4)).max() < 2
+
+
+def test_a_resumed_training_is_the_same(scene, tmp_path):
+    config = replace(CONFIG, exposure="affine", max_steps=24, level_every=12)
+    photos, labels = Exposed(scene.views), np.full(len(scene.points.xyz), -1, np.int16)
+    whole, _ = trained(scene, photos, config)
+    for event in train(scene, photos, labels, config, folder=tmp_path):
+        if getattr(event, "step", 0) == 13:
+            break
+    again, _ = trained(scene, photos, config, folder=tmp_path)
+    assert torch.equal(again.per_view["exposure"].values, whole.per_view["exposure"].values)
+    assert torch.equal(again.gaussians.means, whole.gaussians.means)

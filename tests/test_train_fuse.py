@@ -135,3 +135,13 @@ def test_the_folder_of_the_masks_is_refused(tmp_path: Path) -> None:
     masks = _write(tmp_path, scene, _truth(g, scene))
     with pytest.raises(LabelError, match="these are the masks themselves"):
         fuse(g, scene, masks, tmp_path)
+
+
+def test_views_without_labels_do_not_vote(tmp_path: Path) -> None:
+    g, scene = _scene()
+    images = _truth(g, scene)
+    images[1:] = [np.full_like(image, -1) for image in images[1:]]
+    masks = _write(tmp_path, scene, images)
+    np.testing.assert_array_equal(
+        gather(g, scene, masks, range(4)).shares, gather(g, scene, masks, [0]).shares
+    )

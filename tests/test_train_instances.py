@@ -138,3 +138,12 @@ def test_without_instances_all_stays_as_it_was() -> None:
     found = label(model(4), sightings, TAXONOMY)
     assert found.label_ids.tolist() == [62] * 4
     assert (found.parents, found.alone) == ({}, {})
+
+
+def test_views_that_lost_the_mask_have_no_say() -> None:
+    objects = np.repeat(np.arange(2), 30)
+    sightings = seen(objects, 8, 0.0, 0)
+    sightings.columns[objects == 0, 2:] = CHAIR  # six of eight views have no mask of it
+    sightings.columns[5, 0] = CHAIR  # beside the mask in one of the two views that have it
+    found = label(model(len(objects)), sightings, TAXONOMY)
+    assert adjusted_rand_index(objects, found.label_ids) == 1

@@ -171,3 +171,10 @@ def test_where_it_is_off():
     assert not capped_config(config, 10, 10).outliers  # it is fitted to what the run's training left
     with pytest.raises(RunError, match=r"--train\.outliers does not go with --blocks\.count"):
         blocks.check(BlocksConfig(count=2), config)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [{"exposure": "affine"}, {"poses": True}, {"batch": 2}])
+def test_it_goes_with_what_is_refined(scene, more):
+    _, losses = trained(scene, Figures(scene.views), replace(CONFIG, max_steps=20, outliers=True, **more))
+    assert np.isfinite(losses).all()

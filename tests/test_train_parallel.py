@@ -118,3 +118,25 @@ def test_the_others_do_not_hear_ctrl_c() -> None:
     with parallel._without_ctrl_c():
         assert subprocess.check_output([sys.executable, "-c", code]) == b"True\n"
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_named(capture):  # noqa: F811
+    scene, _, masks, labels = capture
+    with pytest.raises(RunError, match="process 1 of 2 ended with code"):
+        list(train_together(2, 2, scene, Broken(scene), labels, TrainConfig(max_steps=20), masks=masks))
+
+
+class Broken:
+    """Photos that only the first process can read."""
+
+    def __init__(self, scene):
+        from sagesplat.scene.images import Photos
+
+        self.photos = Photos(scene.views)
+
+    def __getitem__(self, row):
+        return self.photos[row]
+
+    def __setstate__(self, state):
+        raise SystemExit(7)

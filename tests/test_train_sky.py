@@ -29,8 +29,9 @@ from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
 from sagesplat.train import densify, sky
-from sagesplat.train.events import Trained
+from sagesplat.train.events import Step, Trained
 from sagesplat.train.lr_schedule import lr_schedule
+from sagesplat.train.nested import order, train_capped
 from sagesplat.train.sky import Shell, find_sky, read_sky, sky_labels, write_sky
 from sagesplat.train.state import from_points, initial_state
 from sagesplat.train.stepper import tune
@@ -243,3 +244,51 @@ def test_without_sky_nothing_changes(finished_run, tmp_path):
     train_scene(job, replace(SMALL_RUN.train, sky="off"), BlocksConfig(), 0)
     before, after = (read_level(path / "levels" / "000004.npz") for path in (finished_run, folder))
     assert all(torch.equal(getattr(before, name), getattr(after, name)) for name in PARAMETERS)
+
+
+def test_a_killed_training_goes_on_with_the_sky(capture, tmp_path):
+    _, photos, _ = capture
+    found, labels = of(capture)
+    begun, ids = found.begin(capture[0], labels)
+    config = TrainConfig(
+        max_steps=8, level_every=4, refine_every=3, refine_start=1, grow_grad=1e-9, sh_degree=1
+    )
+
+    def run(folder, until=99):
+        folder.mkdir(exist_ok=True)
+        for event in train_gaussians(
+            begun, photos, ids, config, backend="cpu", folder=folder, shell=found.shell
+        ):
+            if isinstance(event, Step) and event.step == until:
+                return None  # as if it were killed
+            if isinstance(event, Trained):
+                return event.gaussians
+        raise AssertionError
+
+    assert run(tmp_path / "killed", until=6) is None
+    whole, resumed = run(tmp_path / "whole"), run(tmp_path / "killed")
+    assert all(torch.equal(getattr(whole, name), getattr(resumed, name)) for name in PARAMETERS)
+
+
+def test_base_model_and_order(capture):
+    """The base model has its share of the sky; what lies on the shell is sky, and nothing else is."""
+    scene, photos, masks = capture
+    found, labels = of(capture)
+    *_, done = train_capped(scene, photos, labels, TrainConfig(sh_degree=1), 60, 4, backend="cpu", sky=found)
+    assert isinstance(done, Trained)
+    g = done.gaussians
+    assert len(g) == 60
+    assert off_shell(found.shell, g.means[g.label_ids == SKY]) < 1e-5
+    blob = g.select(torch.tensor([0]))  # in front of the sky of all views
+    camera = scene.views[scene.train_ids[0]].camera
+    place = np.linalg.inv(camera.w2c) @ [0, -0.9, 3, 1]
+    blob = replace(
+        blob, means=torch.tensor(place[None, :3], dtype=torch.float32), log_scales=torch.full((1, 3), -1.0)
+    )
+    blob = replace(
+        blob, logit_opacities=torch.tensor([4.0]), label_ids=torch.tensor([TREE], dtype=torch.int16)
+    )
+    ordered = order(concat([g, blob]), scene, masks, shell=found.shell).gaussians
+    assert torch.equal(ordered.label_ids == SKY, found.shell.holds(ordered.means))
+    plain = order(concat([g, blob]), scene, masks).gaussians
+    assert not torch.equal(plain.label_ids == SKY, found.shell.holds(plain.means))

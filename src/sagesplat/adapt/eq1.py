@@ -1,4 +1,4 @@
-"""Plans of snapshots, by Eq. 1 of the paper: for each category the smallest level that reaches the target."""
+"""Plans of recorded levels, by Eq. 1 of the paper: of each category the smallest that reaches the target."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Which level of each category meets a target at the least Gaussians (Eq. 1 of the paper); plan.json."""
+"""Plans: the level of each category, with what it costs and whether it meets the target."""
 
 import math
 from collections.abc import Mapping

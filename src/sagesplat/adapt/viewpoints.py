@@ -33,7 +33,7 @@ from sagesplat.scene.nerfstudio import Poses
 from sagesplat.scene.scene import Camera, Scene
 
 SETS = ("fit", "bias", "calibration")  # what they are for; none of them is used for another
-LARGEST_TURN = float(np.pi)
+LARGEST_TURN = 3.1416  # half a turn, as `SampleConfig.turn`
 _TRIES = 50
 _CLEAR = 0.5  # of the way to the closest point that its cameras have
 
@@ -83,7 +83,7 @@ def draw(
     Raises:
         RunError: For a rule that cannot be followed.
     """
-    check_limits(rule)
+    check_limits(rule, "sample.")
     sampler = _Sampler(scene, base, rule)
     cameras, sets = [], []
     for name, count in counts.items():

@@ -89,7 +89,7 @@ def shortened(text: str) -> str:
 
 
 def _columns(typical: int, of_long: int, labels: Sequence[int], names: Mapping[int, str]) -> int:
-    """Columns of a legend of these names: the usual number, or `of_long` where a name is long."""
+    """Columns of a legend of these names: `typical`, or `of_long` where a name is long."""
     longest = max((len(caption(label, names)) for label in labels), default=0)
     return typical if longest <= _LONG else of_long
 

@@ -91,7 +91,10 @@ def counts_table(counts: Counts, labels: Sequence[int], names: Mapping[int, str]
 def ladder_table(
     rows: Observations, counts: Counts, recovering: frozenset[int], names: Mapping[int, str]
 ) -> Table:
-    """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some levels."""
+    """Tables I and II in one, for a terminal: mean SSIM and thousands of Gaussians at some levels.
+
+    Those just after an opacity reset are left out where there are others.
+    """
     levels = sorted({level for _, level in counts})
     not_recovering = [level for level in levels if level not in recovering] or levels
     spread = np.linspace(0, len(not_recovering) - 1, _COLUMNS).round().astype(int)

@@ -29,7 +29,7 @@ from sagesplat.train.clean import clean, find_floaters
 
 _VIEWS = 96  # viewpoints that are drawn where there are none
 _FOV, _SIZE = 60.0, (512, 384)  # degrees along the longer side, px
-_DRAWN = "viewpoints were drawn; --cameras of its photos would tell what few views show"
+_DRAWN = "viewpoints were drawn; --cameras of its photos would tell what they hardly show"
 _SIDE = 1024  # px, longer side of the views of a capture; larger ones are looked at smaller
 
 
@@ -40,8 +40,8 @@ def clean_splat(
     """Write a splat without its floaters; what stays is as it was.
 
     From PLY to PLY rows are copied with all their properties. `cameras`: where its photos were taken from, a
-    capture with or without photos, or a file of cameras; None: viewpoints are drawn, and what few views or
-    hardly any show is then no criterion. `picture`: PNG of views before and after.
+    capture with or without photos, or a file of cameras; None: viewpoints are drawn, and what they hardly
+    show is then no criterion. `picture`: PNG of views before and after.
     """
     check_limits(config, "clean.")
     _check_paths(source, out, picture, config)

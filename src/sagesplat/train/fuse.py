@@ -56,8 +56,8 @@ def gather(
     """Let the pixels of `views` (rows of `Scene.views`) vote on the Gaussians that contribute to them.
 
     A pixel's vote is its category in `masks`, times the blending weight (alpha times transmittance) of the
-    Gaussian. Unlabelled is a candidate too, but views without any label
-    do not vote, and no pixel that is not `valid`. `on_view(done)` is called after each view.
+    Gaussian. Unlabelled is a candidate too, but views without any label do not vote, and no pixel that is not
+    `valid`. `on_view(done)` is called after each view.
     """
     ids = np.array([UNLABELLED, *sorted(masks.taxonomy.names)], np.int16)
     votes, workspace = np.zeros((len(gaussians), len(ids)), np.float32), Workspace()

@@ -33,8 +33,8 @@ def importance(
     Only pixels that are `valid` count.
 
     weight: blending weight (alpha times transmittance) summed over all pixels; weight-volume: times the
-    volume to the power 0.1, as LightGaussian (arXiv:2311.17245, eq. 3); sensitivity: squared change
-    of the pictures when it fades, to first order: the squared gradients of pictures seen through random signs
+    volume to the power 0.1, as LightGaussian (arXiv:2311.17245, eq. 3); sensitivity: squared change of the
+    pictures when it fades, to first order: the squared gradients of pictures seen through random signs
     (Hutchinson's estimate of the diagonal of Fisher's information).
     """
     if criterion == "sensitivity":
