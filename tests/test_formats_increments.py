@@ -106,7 +106,7 @@ def test_an_index_that_refines_otherwise_is_refused(tmp_path):
     g = replace(random_gaussians(4), label_ids=torch.zeros(4, dtype=torch.int16))
     write_increments(tmp_path, g, {0: (1, 4)}, {0: "a"}, replaces={0: (2,)})
     text = (tmp_path / "index.json").read_text()
-    for wrong in ('"SWAP"', "1"):
+    for wrong in ('"SWAP"', "1", "null", '["REPLACE"]'):
         (tmp_path / "index.json").write_text(text.replace('"REPLACE"', wrong))
         with pytest.raises(DataError, match="not an index of increments"):
             read_index(tmp_path)
