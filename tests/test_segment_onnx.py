@@ -159,7 +159,7 @@ def test_input_and_output_are_resampled_bilinearly(tmp_path):
         (None, "no such file"),
         ({"classes": ["sky"], "coco_panoptic": {}}, "not of the form .*no category of 'sky'"),
         ({"classes": ["sky"], "coco_panoptic": {"sky": 70000}}, "outside 0"),
-        (CLASSES | {"std": 0}, "std: expected float > 0"),
+        (CLASSES | {"std": 0}, "std: expected float >= 1e-30"),
         ({"classes": ["what"], "vocabulary": "coco"}, "names no label"),
     ],
 )
