@@ -311,3 +311,12 @@ def test_spz_axes(tmp_path):
     (tmp_path / "a.spz").write_bytes(encode_spz(g, frame="rdf", fractional_bits=12))
     close(read_splat(tmp_path / "a.spz", spz_axes="rdf").gaussians.means, g.means, 1e-3)
     close(read_splat(tmp_path / "a.spz").gaussians.means, g.means * torch.tensor([1, -1, -1]), 1e-3)
+
+
+def test_a_codebook_that_is_too_short_drops_what_needs_it(tmp_path):
+    meta, images = sog(40, 0)
+    meta["scales"]["codebook"] = meta["scales"]["codebook"][:200]
+    splat = read_splat(put_sog(tmp_path, meta, images))
+    wrong = int((images["scales.webp"].reshape(-1, 4)[:40, :3] >= 200).any(1).sum())
+    assert wrong
+    assert splat.dropped == {"NaN or infinite": wrong}
