@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sagesplat.core.errors import SceneError
 from sagesplat.demo import capture
 from sagesplat.demo.cameras import demo_cameras
 from sagesplat.demo.capture import cached_capture, make_capture
@@ -96,3 +97,25 @@ def test_cache_is_made_once(tmp_path, monkeypatch):
     assert cached_capture() == cached_capture() == calls[0]
     assert len(calls) == 1
     assert calls[0].parents[1] == tmp_path / "cache"
+
+
+def test_a_stopped_run_leaves_nothing(tmp_path):
+    def stop(done, views):
+        assert views == 12
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        small(tmp_path / "garden", stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_refusals(tmp_path):
+    (tmp_path / "there").mkdir()
+    with pytest.raises(SceneError, match="already exists"):
+        make_capture(tmp_path / "there")
+    with pytest.raises(SceneError, match="at least 3"):
+        make_capture(tmp_path / "few", views=2)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SceneError, match="cannot be written"):
+        make_capture(tmp_path / "file" / "below")

@@ -1,10 +1,15 @@
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial import KDTree
 
-from sagesplat.demo.capture import make_capture
+from sagesplat.core.errors import SceneError
+from sagesplat.demo import capture
+from sagesplat.demo.cameras import grid_cameras
+from sagesplat.demo.capture import cached_capture, make_capture
 from sagesplat.demo.places import centres_of
 from sagesplat.demo.points import project
+from sagesplat.demo.render import lit_world
 from sagesplat.scene.colmap import load_colmap
 
 PLACES, VIEWS, WIDTH, HEIGHT = (2, 2), 40, 48, 36
@@ -46,3 +51,32 @@ def test_table_tops_are_where_the_photos_show_them(scene, masks):
         assert len(found) > 30
         assert (found == TABLE).mean() > 0.55
         assert set(found) <= {TABLE, 86, 64, PAVEMENT}
+
+
+def test_cameras_keep_clear(workspace):
+    world = lit_world(0, PLACES)  # the workspace's, still in memory
+    at = np.stack([camera.position for camera in grid_cameras(PLACES, 400, WIDTH, HEIGHT, 0)]).astype(float)
+    assert KDTree(world.leaves[:, :3]).query(at)[0].min() > 0.25
+    for planes in world.bodies:
+        assert ((planes[:, :3] @ at.T) > planes[:, 3:]).any(0).all()
+
+
+def test_refusals(tmp_path):
+    with pytest.raises(SceneError, match="0 x 2 places"):
+        make_capture(tmp_path / "none", places=(0, 2))
+    with pytest.raises(SceneError, match="at least 10 each"):
+        make_capture(tmp_path / "few", places=(2, 2), views=39)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cache_keeps_grids_apart(tmp_path, monkeypatch):
+    calls = []
+
+    def fake(folder, **arguments):
+        calls.append((folder.name, arguments["places"], arguments.get("views")))
+        folder.mkdir(parents=True)
+
+    monkeypatch.setattr(capture, "make_capture", fake)
+    monkeypatch.setenv("SAGESPLAT_CACHE", str(tmp_path))
+    assert cached_capture().parent == cached_capture(places=(3, 2)).parent == cached_capture().parent
+    assert calls == [("courtyard", (1, 1), None), ("courtyards-3x2", (3, 2), 630)]

@@ -158,3 +158,20 @@ def test_a_full_disk(sources, tmp_path, monkeypatch):
     with pytest.raises(RunError, match="disk is full"):
         download_lpips(tmp_path, ["alex"], sources=sources)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_published_layers_are_convolutions():
+    """torchvision numbers convolutions, activations and poolings in one row."""
+    rows = {"alex": "cr p cr p cr cr cr p", "vgg": "cr cr p cr cr p cr cr cr p cr cr cr p cr cr cr p"}
+    for net, source in SOURCES.items():
+        layers = enumerate(rows[net].replace(" ", ""))
+        assert source.convolutions == tuple(i for i, layer in layers if layer == "c")
+        assert source.backbone.endswith(f"-{source.sha256[:8]}.pth")  # as torchvision names its files
+        assert len(source.sha256) == len(source.heads_sha256) == 64
+
+
+def test_no_more_is_downloaded_than_weights_can_have(sources, tmp_path, monkeypatch):
+    monkeypatch.setattr("sagesplat.download.weights.MAX_HEADS", 100)
+    with pytest.raises(DataError, match=r"cannot be downloaded \(more than 0\.0001 MB\)"):
+        download_lpips(tmp_path, ["alex"], sources=sources)
+    assert list(tmp_path.iterdir()) == []

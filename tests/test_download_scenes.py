@@ -4,6 +4,8 @@ import errno
 import io
 import re
 import stat
+import subprocess
+import sys
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -401,3 +403,72 @@ def test_the_registry():
         assert scene.scale in scene.scales
         assert 10**9 <= scene.limit <= 12 * 10**9
         assert "https://" in scene.licence
+
+
+def test_a_kill_between_members(site, tmp_path):
+    """The process ends without a word; what was finished stays."""
+    code = f"""if True:
+        import os
+        from dataclasses import replace
+        from pathlib import Path
+        from sagesplat.download.scenes import download_scene, find_scene
+
+        def stop(name, done, total):
+            if done > total / 2:
+                os._exit(7)
+
+        scene = replace(find_scene({NAME!r}), url={site.url!r})
+        download_scene({NAME!r}, Path({str(tmp_path)!r}), registry={{scene.name: scene}}, on_progress=stop)
+    """
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 7
+    left = {name: content for name, content in contents(tmp_path).items() if "/." not in name}
+    assert left.items() <= expected().items()
+    assert 2 < len(left) < len(expected())
+    site.asked.clear()
+    fetch(site, tmp_path)
+    late = len(site.asked) - (2 + len(expected()) - len(left))
+    assert 0 <= late <= 4  # what the killed one asked for last may be answered after all
+    assert contents(tmp_path).items() >= expected().items()
+
+
+def test_what_an_archive_may_hold(site, tmp_path):
+    with pytest.raises(DataError, match=r"takes 0.00\d+ GB where 0.0001 GB is the most"):
+        fetch(site, tmp_path, registry=registry(site, limit=10**5))
+    with pytest.raises(DataError, match="holds no garden/images_16/"):
+        fetch(site, tmp_path, scale=16, registry=registry(site, scales=(16,)))
+    with pytest.raises(DataError, match="holds no garden2/images_4/"):
+        fetch(site, tmp_path, registry=registry(site, folder="garden2"))
+    site.archive = archive({k: v for k, v in layout().items() if "sparse" not in k})
+    with pytest.raises(DataError, match="holds no garden/sparse/0/"):
+        fetch(site, tmp_path)
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        site.archive = twice()
+    with pytest.raises(DataError, match="twice"):
+        fetch(site, tmp_path)
+    assert contents(tmp_path) == {}
+
+
+def twice() -> bytes:
+    buffer = io.BytesIO()
+    buffer.write(ARCHIVE)
+    with zipfile.ZipFile(buffer, "a") as file:
+        file.writestr("garden/images_4/DSC00001.JPG", b"another")
+    return buffer.getvalue()
+
+
+def test_names_and_scales_that_there_are_not(site, tmp_path):
+    with pytest.raises(DataError) as caught:
+        download_scene("mipnerf360/gardem", tmp_path)
+    assert_one_line(caught.value, "mipnerf360/gardem: no such scene", "mipnerf360/garden, ", "db/playroom")
+    for scale in 0, 3, -4:
+        with pytest.raises(DataError) as caught:
+            fetch(site, tmp_path, scale=scale)
+        assert_one_line(caught.value, f"{NAME}: no photos at scale {scale}; take one of 1, 2, 4, 8")
+    assert site.asked == []
+
+
+def test_a_huge_directory_is_not_read(site, tmp_path, monkeypatch):
+    monkeypatch.setattr(remote_zip, "MAX_DIRECTORY", 1000)
+    monkeypatch.setattr(remote_zip, "TAIL", 100)
+    with pytest.raises(DataError, match=r"a directory of \d+ bytes"):
+        fetch(site, tmp_path)

@@ -10,6 +10,8 @@ from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
 from sagesplat.core.errors import DataError
 from sagesplat.formats.increments import read_increments, read_index, shown, totals, write_increments
 from sagesplat.formats.levels import write_set
+from sagesplat.formats.ply import read_ply, write_ply
+from sagesplat.formats.splats import read_splat
 
 
 def test_increments_of_long_and_like_names_are_files_of_their_own(tmp_path):
@@ -106,7 +108,24 @@ def test_an_index_that_refines_otherwise_is_refused(tmp_path):
     g = replace(random_gaussians(4), label_ids=torch.zeros(4, dtype=torch.int16))
     write_increments(tmp_path, g, {0: (1, 4)}, {0: "a"}, replaces={0: (2,)})
     text = (tmp_path / "index.json").read_text()
-    for wrong in ('"SWAP"', "1"):
+    for wrong in ('"SWAP"', "1", "null", '["REPLACE"]'):
         (tmp_path / "index.json").write_text(text.replace('"REPLACE"', wrong))
         with pytest.raises(DataError, match="not an index of increments"):
             read_index(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz"])
+def test_files_say_how_they_were_trained(tmp_path, kind):
+    g = random_gaussians(4, degree=0)
+    g = replace(g, label_ids=torch.zeros(4, dtype=torch.int16))
+    for antialiased in (True, False):
+        listed = write_increments(
+            tmp_path / "out", g, {0: (4,)}, {0: "a"}, kind=kind, antialiased=antialiased
+        )
+        assert read_splat(tmp_path / "out" / listed[0].uri).antialiased is antialiased
+
+
+def test_a_ply_of_any_names_reads_back(tmp_path):
+    g = random_gaussians(3)
+    write_ply(tmp_path / "a.ply", g, {-1: "a\nend_header", 3: "\ud800", 184: "日" * 5000})
+    assert len(read_ply(tmp_path / "a.ply")) == 3

@@ -126,3 +126,9 @@ def test_not_a_level(tmp_path):
         with pytest.raises(DataError, match=rf"{path.name}: not a") as caught:
             read_level(path)
         assert "\n" not in str(caught.value)
+
+
+def test_harmonics_not_yet_in_use_are_left_out(tmp_path):
+    path = write_level(tmp_path, 5, random_gaussians(30), recovering=False, sh_degree=1)
+    assert read_level(path).shN.shape == (30, 3, 3)
+    assert read_header(path).sh_degree == 1

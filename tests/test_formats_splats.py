@@ -239,6 +239,8 @@ def test_a_level_of_a_streamed_sog(tmp_path):
     refused(path, "no level 2; it has 0 (the finest) to 1", lod=2)
     path.write_text(json.dumps(streamed() | {"environment": "1_0/meta.json"}))
     assert same(read_splat(path).gaussians, concat([fine, coarse]))
+    path.write_text(json.dumps(streamed() | {"environment": ""}))  # as other tools say that there is none
+    assert same(read_splat(path).gaussians, fine)
 
 
 def test_a_streamed_sog_that_does_not_fit_together(tmp_path):
@@ -248,6 +250,8 @@ def test_a_streamed_sog_that_does_not_fit_together(tmp_path):
     for change, message in (
         ({"filenames": ["../b/meta.json"] * 2}, "is not in its folder"),
         ({"filenames": [str(tmp_path / "b" / "meta.json")] * 2}, "is not in its folder"),
+        ({"filenames": ["a\u202eb"] * 2}, "is no file name"),
+        ({"environment": "x" * 1001}, "is no file name"),
         ({"lodLevels": 0}, "lodLevels: expected int >= 1"),
         ({"tree": {"lods": {"0": leaf | {"offset": 3}}}}, "do not fit the 6 rows"),
         ({"tree": {"children": [{"lods": {"0": leaf}}] * 2}}, "do not fit the 6 rows"),
@@ -307,3 +311,12 @@ def test_spz_axes(tmp_path):
     (tmp_path / "a.spz").write_bytes(encode_spz(g, frame="rdf", fractional_bits=12))
     close(read_splat(tmp_path / "a.spz", spz_axes="rdf").gaussians.means, g.means, 1e-3)
     close(read_splat(tmp_path / "a.spz").gaussians.means, g.means * torch.tensor([1, -1, -1]), 1e-3)
+
+
+def test_a_codebook_that_is_too_short_drops_what_needs_it(tmp_path):
+    meta, images = sog(40, 0)
+    meta["scales"]["codebook"] = meta["scales"]["codebook"][:200]
+    splat = read_splat(put_sog(tmp_path, meta, images))
+    wrong = int((images["scales.webp"].reshape(-1, 4)[:40, :3] >= 200).any(1).sum())
+    assert wrong
+    assert splat.dropped == {"NaN or infinite": wrong}

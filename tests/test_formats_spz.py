@@ -376,3 +376,9 @@ def test_damaged_version_4(tmp_path, content, message):
     (tmp_path / "a.spz").write_bytes(content)
     with pytest.raises(DataError, match=rf"a\.spz: .*{message}"):
         read_spz_splat(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e30])
+def test_rotations_of_any_length(size):
+    g = one(quats=[size, -size, size / 2, 0.0])
+    assert torch.allclose(rotations(decode_spz(encode_spz(g)).quats), rotations(g.quats), atol=2e-3)

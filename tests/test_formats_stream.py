@@ -278,3 +278,19 @@ def test_equal_gaussians_take_the_least_bytes():
     coded = encode_stream(g, [20_000])
     assert 10 < 20_000 / len(coded.content) < 97
     assert len(decode_stream(coded.content).gaussians) == 20_000
+
+
+def test_what_was_decoded_is_encoded_without_further_loss():
+    once = decode_stream(encode_stream(visible(), SIZES).content).gaussians
+    coded = encode_stream(once, SIZES)
+    again, once = decode_stream(coded.content).gaussians, once.select(torch.from_numpy(coded.rows))
+    torch.testing.assert_close(again.shN, once.shN, rtol=0, atol=0)
+    torch.testing.assert_close(again.log_scales, once.log_scales, rtol=0, atol=0)
+    torch.testing.assert_close(again.sh0, once.sh0, rtol=0, atol=1e-5)
+    torch.testing.assert_close(again.logit_opacities, once.logit_opacities, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("level", [0, 4, -1])
+def test_levels_that_a_stream_does_not_have(level: int):
+    with pytest.raises(DataError, match="of 3"):
+        decode_stream(encode_stream(visible(9), [1, 2, 9]).content, level)

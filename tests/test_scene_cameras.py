@@ -104,3 +104,10 @@ def test_what_is_no_list_of_cameras_is_one_line(tmp_path, document):
         read_camera_file(path)
     assert str(error.value).startswith(str(tmp_path))
     assert "; " in str(error.value)
+
+
+def test_names_are_fit_to_be_shown(tmp_path):
+    found = read_camera_file(
+        put(tmp_path, [entry(0) | {"img_name": "a\x1b[2J\n"}, entry(1) | {"img_name": 3}])
+    )
+    assert [one.name for one in found] == ["a_[2J_", "001"]

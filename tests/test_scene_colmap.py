@@ -218,3 +218,11 @@ def test_rigs_and_frames_of_new_versions_are_left_alone(tmp_path):
     for name in ("rigs.bin", "frames.bin"):
         (tmp_path / "sparse/0" / name).write_bytes(b"\xff" * 24)
     assert len(load_colmap(tmp_path).views) == 5
+
+
+def test_too_few_views_and_bad_splits(tmp_path):
+    capture(tmp_path, [PINHOLE], views=2)
+    with pytest.raises(SceneError, match="2 posed photos, but it takes 3"):
+        load_colmap(tmp_path)
+    with pytest.raises(SceneError, match="test_every 1"):
+        load_colmap(tmp_path, test_every=1)

@@ -37,3 +37,17 @@ def test_twice_the_time_is_one_ev(tmp_path):
 def test_what_says_nothing(tmp_path, tags):
     photo(tmp_path / "a.tiff", tags)
     assert exposure_of(tmp_path / "a.tiff") is None
+
+
+def test_smaller_apertures_and_lower_iso_are_darker(tmp_path):
+    photo(tmp_path / "a.jpg", {TIME: IFDRational(1, 100), APERTURE: IFDRational(2), ISO: 200})
+    photo(tmp_path / "b.jpg", {TIME: IFDRational(1, 100), APERTURE: IFDRational(4), ISO: 100})
+    a, b = (exposure_of(tmp_path / f"{name}.jpg") for name in "ab")
+    assert a is not None
+    assert b == pytest.approx(a - 3)
+
+
+def test_what_is_no_photo(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff\xe1nothing")
+    assert exposure_of(tmp_path / "a.jpg") is None
+    assert exposure_of(tmp_path / "gone.jpg") is None

@@ -364,3 +364,8 @@ def test_detect_says_what_it_looked_for(tmp_path):
         SceneError, match=r"no capture \(looked for .*cameras.bin.*transforms.json.*photos in"
     ):
         detect(tmp_path)
+
+
+def test_opaque_photos_keep_the_black_background(tmp_path):
+    blender(tmp_path, channels=3)
+    assert {v.camera.background for v in load_blender(tmp_path).views} == {(0, 0, 0)}

@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 from test_scene_points import looking
 
-from sagesplat.core.errors import BackendUnavailable, SceneError
+from sagesplat.core.errors import BackendUnavailable, SageError, SceneError
 from sagesplat.core.names import check_photo, collision_key
 from sagesplat.scene import load_scene, photos
 from sagesplat.scene._prepare import prepare_photos
@@ -591,3 +591,42 @@ def test_awkward_names_of_photos_are_mended(tmp_path: Path) -> None:
     for name in finals:
         check_photo(name)
         assert name.lower().endswith(".png")
+
+
+@pytest.mark.parametrize(
+    "damage", ["{", "[]", "{}", '{"complete": true}', '{"complete": true, "seconds": 3}']
+)
+def test_a_damaged_report_is_made_again(tmp_path: Path, damage: str) -> None:
+    (tmp_path / "sfm").mkdir()
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sfm" / "request.json").write_text(json.dumps({"a": 1, "threads": 2}))
+    (tmp_path / "poses.json").write_text(damage)
+    assert photos._resume(tmp_path, {"a": 1}) is None
+    (tmp_path / "sfm" / "request.json").write_text(damage)
+    assert photos._resume(tmp_path, {"a": 1}) is None
+
+
+def test_many_photos_and_videos_are_matched_in_sequence(tmp_path: Path) -> None:
+    Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
+    found, _ = prepare_photos(tmp_path, tmp_path / "t", tmp_path / "t", lambda done, total: None)
+    assert photos._request(tmp_path, found * 100, PosesConfig())["matching"] == "exhaustive"
+    assert photos._request(tmp_path, found * 101, PosesConfig())["matching"] == "sequential"
+    assert photos._request(tmp_path / "a.png", found, PosesConfig())["matching"] == "sequential"
+    chosen = PosesConfig(matching="exhaustive")
+    assert photos._request(tmp_path / "a.png", found, chosen)["matching"] == "exhaustive"
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (PosesConfig(model="PINHOL"), "PINHOL: COLMAP cannot undistort it; take one of SIMPLE_PINHOLE"),
+        (PosesConfig(max_size=0), "--poses.max-size 0 is impossible; choose a number from 64"),
+        (PosesConfig(min_registered=1.5), "--poses.min-registered 1.5 is impossible"),
+    ],
+)
+def test_settings_that_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: PosesConfig, message: str
+) -> None:
+    monkeypatch.setattr(photos.importlib.util, "find_spec", lambda name: name)
+    with pytest.raises(SageError, match=message):
+        reconstruct(tmp_path, tmp_path / "out", config)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import project
-from sagesplat.scene.points import FAR, focus, random_points, read_points
+from sagesplat.scene.points import FAR, GREY, focus, random_points, read_points
 from sagesplat.scene.scene import Camera, View
 
 XYZ = np.array([[0.5, -1, 2], [3, 4, -5.25], [0, 0, 1e-3]], np.float32)
@@ -222,3 +222,26 @@ def test_colour_is_the_mean_of_the_photos_that_show_a_point(tmp_path):
         count += inside
     np.testing.assert_allclose(points.rgb[:, 0], 255 * total / count, atol=0.51)
     assert (points.rgb[:, 1:] == 0).all()
+
+
+def test_without_colours_grey(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(header("binary_little_endian", *AXES) + XYZ.tobytes())
+    points = read_points(path)
+    np.testing.assert_array_equal(points.xyz, XYZ)
+    assert (points.rgb == GREY).all()
+
+
+def test_photos_that_share_nothing_are_refused(tmp_path):
+    apart = [looking(np.array([0, 0, 0.0]), np.array([x, 0, 0.0])) for x in (1, -1)]
+    for poses in (apart, apart[:1]):
+        with pytest.raises(SceneError, match="no two photos show the same part"):
+            random_points(views_of(poses, tmp_path), 100)
+
+
+def test_cube_of_blender(tmp_path):
+    views = views_of(ring(np.zeros(3), 4), tmp_path)
+    points = random_points(views, 5000, cube=1.3)
+    assert np.abs(points.xyz).max() <= 1.3
+    np.testing.assert_allclose(points.xyz.mean(0), 0, atol=0.05)
+    np.testing.assert_allclose(points.xyz.std(0), 2.6 / np.sqrt(12), rtol=0.03)

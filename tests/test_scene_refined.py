@@ -69,3 +69,9 @@ def test_a_job_takes_them_up_when_they_are_written(tmp_path, scene):
     assert job.run.scene_files == [job.run.scene, job.run.cameras]
     job.run.cameras.unlink()
     assert job.scene is job.given_scene
+
+
+def test_of_other_views_is_refused(tmp_path, scene):
+    write_refined(tmp_path / "cameras.npz", moved(scene))
+    with pytest.raises(RunError, match="not the refined cameras of 7 views"):
+        read_refined(tmp_path / "cameras.npz", 7)

@@ -229,3 +229,23 @@ def test_blur_lowers_sharpness(seed: int, sigma: float) -> None:
     assert sharpness(gaussian_filter(grey, sigma)) < sharpness(grey)
     assert sharpness(np.full((9, 9), 7, np.uint8)) == 0
     assert sharpness(grey[:2]) == 0
+
+
+def test_a_video_of_too_many_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = write_video(tmp_path / "a.mp4", pan(12))
+    monkeypatch.setattr(video, "MAX_FRAMES", 11)
+    with pytest.raises(SceneError, match=r"a\.mp4: 12 frames of .* too many; cut or convert"):
+        extract_frames(film, tmp_path / "f")
+
+
+def test_packets_that_hold_more_than_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where an index names the same bytes again and again."""
+    film = write_video(tmp_path / "a.mp4", pan(12))
+    monkeypatch.setattr(video, "_PACKED", 0.5)
+    with pytest.raises(SceneError, match="bytes or more are too many"):
+        extract_frames(film, tmp_path / "f")
+
+
+def test_long_videos_keep_three_frames_to_choose_from(tmp_path: Path) -> None:
+    assert len(extract_frames(write_video(tmp_path / "a.mp4", pan(240)), tmp_path / "a")) == 80
+    assert len(extract_frames(write_video(tmp_path / "b.mp4", pan(40)), tmp_path / "b")) == 40

@@ -104,3 +104,10 @@ def test_cocos_own_annotations(tmp_path):
         counted.pop(-1, None)
         assert counted == areas
         assert all(coco.NAMES[i] == name for i, name in taxonomy.names.items())
+
+
+def test_the_table_is_cocos():
+    assert len(coco.NAMES) == len(set(coco.NAMES.values())) == 133
+    assert (coco.NAMES[1], coco.NAMES[200]) == ("person", "rug-merged")
+    assert coco.COLORS[1] == (220, 20, 60)
+    assert coco.COLORS[200] == (250, 141, 255)

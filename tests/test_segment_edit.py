@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import Camera, View
@@ -188,3 +189,39 @@ def test_typed_accents_are_those_of_the_file():
         taxonomy, keep=parse_names("cafe\u0301", "keep"), merge=parse_merge("vase=cafe\u0301")
     )
     assert left.names == {1: "caf\u00e9"}
+
+
+def test_masks_that_cannot_be_read_write_nothing(tmp_path: Path) -> None:
+    views = _folder(tmp_path)
+    Image.new("L", (3, 2)).save(tmp_path / "1.png")
+    before = _bytes(tmp_path)
+    with pytest.raises(LabelError, match="unknown ids 0"):
+        edit_labels(tmp_path, views, merge={"vase": "potted plant"})
+    (tmp_path / "labels.json").unlink()
+    del before["labels.json"]
+    with pytest.raises(LabelError, match=r"labels\.json: no such file"):
+        edit_labels(tmp_path, views)
+    assert _bytes(tmp_path) == before
+
+
+def test_merging_into_unlabelled() -> None:
+    taxonomy, table = edit_table(TAXONOMY, merge={"vase": "unlabelled"})
+    assert VASE not in taxonomy.names
+    assert table[VASE] == -1
+
+
+def test_merging_before_folding_saves_the_rare(tmp_path: Path) -> None:
+    views = _folder(tmp_path)
+    edited = edit_labels(tmp_path, views, merge={"vase": "pot"}, min_share=0.1)
+    assert edited.folded == {"pot": 1 / 16}
+    views = _folder(tmp_path)
+    edited = edit_labels(tmp_path, views, merge={"vase": "potted plant"}, min_share=0.2)
+    assert edited.shares == {"potted plant": 4 / 16, "tree-merged": 6 / 16}
+    assert edited.folded == {"car": 3 / 16}
+    assert not edited.dropped
+
+
+def test_names_are_checked_with_the_option_that_they_were_given_to() -> None:
+    assert parse_names("chair 2, vase", "only") == ("chair 2", "vase")
+    with pytest.raises(LabelError, match=r"^only 'x+\.\.\.x+': it has 300 characters"):
+        parse_names("x" * 300, "only")

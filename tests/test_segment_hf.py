@@ -318,3 +318,10 @@ def test_queries_that_others_hide_are_no_instances() -> None:
     assert (
         panoptic.instances_of([(weights, logits)], [np.s_[0:4, 0:8]], np.zeros(2, bool), (4, 8)) == -1
     ).all()
+
+
+def test_photos_no_network_can_take(folders: dict[str, Path]) -> None:
+    segmenter = HfSegmenter(folders["eomt"], device="cpu")
+    with pytest.raises(LabelError, match="cannot take a photo of 300 x 1 pixels") as caught:
+        segmenter([noise(1, 300)])
+    assert "\n" not in str(caught.value)

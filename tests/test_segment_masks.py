@@ -8,9 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, SceneError
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.undistort import pinhole
+from sagesplat.segment import masks as masks_module
+from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, prepare_folder, read_mask, write_mask
 
@@ -303,3 +305,71 @@ def test_photos_that_some_disks_take_for_one(tmp_path):
     for one, other in (("a.jpg", "A.png"), ("caf\u00e9.jpg", "cafe\u0301.jpg"), ("a.jpg", "a.png")):
         with pytest.raises(LabelError, match="has the same name but for the suffix or capitals; rename one"):
             prepare_folder(tmp_path, scene_of(one, other).views)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda raw: [],
+        lambda raw: {"lenses": 3},
+        lambda raw: raw | {"photos": {"a.jpg": [1, 1]}},
+        lambda raw: raw | {"photos": {"a.jpg": [0, 9]}},
+        lambda raw: raw | {"photos": {"a.jpg": [0]}},
+        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"model": "NONE"}]},
+        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"params": [1e999, 1, 1, 1]}]},
+        lambda raw: raw | {"lenses": [raw["lenses"][0] | {"width": 1e999}]},
+    ],
+)
+def test_a_damaged_report_of_poses_is_one_line(tmp_path, damage):
+    scene, _, _ = undistorted_capture(tmp_path / "capture")
+    save(tmp_path / "m" / "a.png", taken())
+    path = tmp_path / "capture" / "poses.json"
+    raw = json.loads(path.read_text())["raw"]
+    path.write_text(json.dumps({"raw": damage(raw)}))
+    with pytest.raises(
+        SceneError, match=r"poses\.json: not a report of poses \(.*\); find the poses again"
+    ) as raised:
+        imported(scene, tmp_path / "m")
+    assert "\n" not in str(raised.value)
+
+
+def test_the_cache_keeps_what_fits(tmp_path, monkeypatch):
+    taxonomy, scene = Taxonomy({3: "car"}), scene_of("a.jpg", "b.jpg")
+    for name in "ab":
+        write_mask(tmp_path / f"{name}.png", np.full((2, 4), 3, np.int16), taxonomy)
+    monkeypatch.setattr(masks_module, "CACHE_BYTES", 20)
+    masks = Masks(tmp_path, taxonomy)
+    assert all((masks[v] == 3).all() for v in scene.views)
+    assert masks[scene.views[0]] is masks[scene.views[0]]
+    assert masks[scene.views[1]] is not masks[scene.views[1]]
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("x" * 101, "101 characters"), ("a\x1b[31m", r"U\+001B"), ("a\ud800", "not UTF-8"), (" ", "blank"),
+        ("a\u202eb", r"U\+202E"), (" a", "begins or ends with a space"), (7, "no text"),
+    ],
+)  # fmt: skip
+def test_names_that_may_not_be_are_refused_where_they_are_read(tmp_path, name, why):
+    save(tmp_path / "a.png", IDS, {"labels": {"3": name, "184": "tree"}})
+    with pytest.raises(LabelError, match=f"{why}; rename it") as raised:
+        imported(scene_of("a.jpg"), tmp_path)
+    said = str(raised.value)
+    assert said.startswith(f"{tmp_path / 'labels.json'}: label 3 is named ")
+    assert said.isprintable()
+    assert len(said) < 600
+
+
+def test_an_accent_in_two_ways_is_one_name(tmp_path):
+    save(tmp_path / "a.png", IDS, {"labels": {"3": "caf\u00e9", "184": "cafe\u0301"}})
+    with pytest.raises(LabelError, match="name of its own"):
+        imported(scene_of("a.jpg"), tmp_path)
+    save(tmp_path / "a.png", IDS, {"labels": {"3": "cafe\u0301", "184": "Tree"}})
+    assert imported(scene_of("a.jpg"), tmp_path)[0].taxonomy.names == {3: "caf\u00e9", 184: "Tree"}
+
+
+def test_the_longest_names_have_room_for_a_block(tmp_path):
+    names = BlockCategories(Taxonomy({3: "x" * 100}), 300).names
+    names.write(tmp_path / "labels.json")
+    assert Taxonomy.read(tmp_path / "labels.json") == names

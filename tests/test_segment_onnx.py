@@ -159,7 +159,7 @@ def test_input_and_output_are_resampled_bilinearly(tmp_path):
         (None, "no such file"),
         ({"classes": ["sky"], "coco_panoptic": {}}, "not of the form .*no category of 'sky'"),
         ({"classes": ["sky"], "coco_panoptic": {"sky": 70000}}, "outside 0"),
-        (CLASSES | {"std": 0}, "std: expected float > 0"),
+        (CLASSES | {"std": 0}, "std: expected float >= 1e-30"),
         ({"classes": ["what"], "vocabulary": "coco"}, "names no label"),
     ],
 )
@@ -284,3 +284,47 @@ def test_real_networks_on_a_real_photo(name):
     found = segmenter([Photos(scene.views)[0]])[0].label_ids
     for label_id, least in ((184, 0.8), (197, 0.8), (187, 0.9)):
         assert (found[given == label_id] == label_id).mean() > least
+
+
+def test_a_network_that_overflows(tmp_path, files):
+    model = write_model(tmp_path / "m.onnx", np.full((3, 3), np.inf))
+    with pytest.raises(LabelError, match="not finite"):
+        OnnxSegmenter(model, files[1])([red_and_blue()])
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((), FLOAT),
+        ((3,), FLOAT),
+        ((1, 3, 16), FLOAT),
+        ((1, 3, 16, 32, 1), FLOAT),
+        ((1, 3, 0, 32), FLOAT),
+        ((1, 3, "height", 32), FLOAT),
+        ((1, 3, 10**9, 10**9), FLOAT),
+        ((1, 3, 2**40, 1), FLOAT),
+        ((1, 3, 16, 32), INT64),
+        ((1, 3, 16, 32), 8),  # strings
+        ((1, 4, 16, 32), FLOAT),
+    ],
+)
+def test_inputs_that_are_no_photo(tmp_path, files, shape, kind):
+    nodes = node("Identity", ["photo"], "logits")
+    model = model_of(tmp_path / "m.onnx", nodes, [("photo", shape, kind)], [("logits", shape, kind)])
+    with pytest.raises(LabelError, match=r"m\.onnx: .*export it") as caught:
+        OnnxSegmenter(model, files[1])
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_models_without_inputs_or_with_two(tmp_path, files):
+    one = field(5, field(1, 1) + field(2, FLOAT) + field(8, "one") + field(9, struct.pack("<f", 1)))
+    two = [("photo", (1, 3, 16, 32), FLOAT), ("other", (1, 3, 16, 32), FLOAT)]
+    cases = [
+        ("0 inputs", node("Identity", ["one"], "logits"), (), [("logits", (1,), FLOAT)], one),
+        ("2 inputs", node("Add", ["photo", "other"], "logits"), two, [LOGITS], b""),
+    ]
+    for complaint, nodes, inputs, outputs, tensors in cases:
+        model = model_of(tmp_path / "m.onnx", nodes, inputs, outputs, tensors)
+        with pytest.raises(LabelError, match=complaint):
+            OnnxSegmenter(model, files[1])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sagesplat.core.config import MasksConfig, SceneConfig
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, Warned
 from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json
@@ -69,3 +70,16 @@ def test_a_new_segmenter_is_one_entry(tmp_path: Path, monkeypatch: pytest.Monkey
     settings = read_json(job.run.provenance("segment"))["settings"]
     assert settings["segmenter"] == "threshold"
     assert len(settings["level"]) == 64  # of the file's content
+
+
+@pytest.mark.parametrize(
+    ("kind", "config", "message"),
+    [
+        ("onnx", MasksConfig(), "--segmenter onnx needs --model"),
+        ("onnx", MasksConfig(model=__file__), "--segmenter onnx needs --model .* and --classes"),
+        ("deeplabv2", MasksConfig(model="no.pth"), "no.pth: no such file; --segmenter deeplabv2 needs"),
+    ],
+)
+def test_missing_files_are_named(kind: str, config: MasksConfig, message: str) -> None:
+    with pytest.raises(RunError, match=message):
+        SEGMENTERS[kind].settings(config)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from sagesplat.core.errors import SceneError
+from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
 from sagesplat.segment.masks import Taxonomy
@@ -18,6 +18,7 @@ from sagesplat.segment.segmenters import (
     Segmented,
     arg_max_resized,
     group_classes,
+    parse_device,
     segment_views,
 )
 
@@ -130,3 +131,13 @@ def test_no_class_that_wins_is_passed_over(logits: np.ndarray, height: int, widt
     found = arg_max_resized(logits, height, width)
     resized = [Image.fromarray(logit).resize((width, height), Image.Resampling.BILINEAR) for logit in logits]
     np.testing.assert_array_equal(found, np.stack([np.asarray(image) for image in resized]).argmax(0))
+
+
+def test_names_of_devices() -> None:
+    assert parse_device("auto") == ("auto", 0)
+    assert parse_device("cpu") == ("cpu", 0)
+    assert parse_device("cuda") == ("cuda", 0)
+    assert parse_device("cuda:12") == ("cuda", 12)
+    for wrong in ("", "gpu", "cuda:", "cuda:-1", "cuda:1 ", "CPU"):
+        with pytest.raises(BackendUnavailable, match="is not known"):
+            parse_device(wrong)

@@ -4,7 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from sagesplat.core.errors import LabelError
 from sagesplat.segment import coco
 from sagesplat.segment.taxonomies import SOURCES, Source, guess_source, to_coco, vocabulary
 
@@ -97,3 +100,51 @@ def test_agrees_with_coco_s_own_list() -> None:
     categories = json.loads(path.read_text(encoding="utf-8"))
     assert to_coco([c["name"] for c in categories], "coco") == [c["id"] for c in categories]
     assert tuple(c["name"] for c in categories if c["isthing"]) == vocabulary("coco-stuff")[:80]
+
+
+def test_coco_is_itself() -> None:
+    assert to_coco(vocabulary("coco")) == sorted(coco.NAMES)
+
+
+def test_coco_stuff_has_the_official_order() -> None:
+    names = vocabulary("coco-stuff")
+    assert names[:80] == vocabulary("coco")[:80]
+    assert names[80:] == tuple(sorted(names[80:]))
+    order = {
+        0: "person",
+        79: "toothbrush",
+        80: "banner",
+        94: "clouds",
+        145: "sky-other",
+        157: "tree",
+        170: "wood",
+    }
+    assert {i: names[i] for i in order} == order
+
+
+def test_ade20k_has_the_official_order() -> None:
+    names = vocabulary("ade20k")
+    order = {
+        0: "wall",
+        2: "sky",
+        9: "grass",
+        19: "chair",
+        25: "house",
+        66: "flower",
+        89: "television",
+        149: "flag",
+    }
+    assert {i: names[i] for i in order} == order
+
+
+@given(st.text(max_size=20), st.sampled_from(SOURCES))
+def test_any_text_is_a_category_or_none(name: str, source: Source) -> None:
+    (label_id,) = to_coco([name], source)
+    assert label_id is None or label_id in coco.NAMES
+
+
+def test_an_unknown_source_is_one_line() -> None:
+    with pytest.raises(LabelError, match=r"^vocabulary 'voc' is not known; use one of coco, coco-stuff, "):
+        vocabulary("voc")  # type: ignore[arg-type]
+    with pytest.raises(LabelError, match="'voc' is not known"):
+        to_coco(["sky"], "voc")  # type: ignore[arg-type]

@@ -8,13 +8,13 @@ import torch
 from text_networks import photo, save
 
 from sagesplat.core.config import MasksConfig
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, RunError, SageError
 from sagesplat.segment.detections import Found
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.prompts import prompts_of
 from sagesplat.segment.registry import SEGMENTERS
 from sagesplat.segment.segmenters import Segmented, Segmenter
-from sagesplat.segment.text import TextOver, TextSegmenter, load_text
+from sagesplat.segment.text import TextOver, TextSegmenter, load_text, settings
 
 WORDS = "stone fountain; ivy; wooden bench; tree"
 
@@ -124,3 +124,44 @@ def test_networks_of_the_wrong_kind(folders: dict[str, str], tmp_path: Path) -> 
         with pytest.raises(LabelError, match=complaint) as caught:
             load_text(config, "cpu", 1, [].append, {})
         assert "\n" not in str(caught.value)
+
+
+def test_what_the_answers_depend_on(tmp_path: Path) -> None:
+    config = MasksConfig(segmenter="text", prompts="ivy; the tree")
+    assert settings(config) == {
+        "model": "IDEA-Research/grounding-dino-tiny", "mask_model": "facebook/sam2.1-hiera-tiny",
+        "prompts": ["ivy", "the tree"], "prompt_threshold": 0.0,
+    }  # fmt: skip
+    given = MasksConfig(segmenter="text", prompts="ivy", model=str(tmp_path), mask_model="a/b")
+    assert settings(given) | {"prompts": 0} == {
+        "model": tmp_path, "mask_model": "a/b", "prompts": 0, "prompt_threshold": 0.0,
+    }  # fmt: skip
+    over = MasksConfig(segmenter="hf", prompts="ivy", model="eomt", prompt_model="google/owl")
+    assert settings(over)["model"] == "google/owl"
+
+
+@pytest.mark.parametrize(
+    ("config", "complaint"),
+    [
+        (MasksConfig(segmenter="text"), '--segmenter text needs --prompts "stone fountain; ivy'),
+        (MasksConfig(segmenter="text", prompts=" "), "needs --prompts"),
+        (MasksConfig(prompts="a;;b"), "one is empty"),
+        (
+            MasksConfig(prompts="ivy", prompt_threshold=1.0),
+            "--prompt-threshold 1.0 is impossible; choose a number from 0 to below 1",
+        ),
+        (MasksConfig(prompts="ivy", prompt_threshold=float("nan")), "--prompt-threshold nan is impossible"),
+        (MasksConfig(segmenter="text", prompts="ivy", model="a", prompt_model="b"), "leave one of them"),
+    ],
+)
+def test_settings_that_cannot_be(config: MasksConfig, complaint: str) -> None:
+    with pytest.raises(SageError, match=complaint) as caught:
+        SEGMENTERS["text"].settings(config)
+    assert isinstance(caught.value, RunError | LabelError)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_usual_threshold_is_the_family_s(folders: dict[str, str]) -> None:
+    for model, masks, usual in (("dino", "sam2", 0.3), ("owlv2", "sam", 0.2), ("sam3", None, 0.5)):
+        config = config_of(folders, model, masks, threshold=0)
+        assert load_text(config, "cpu", 1, [].append, {}).threshold == usual

@@ -6,20 +6,20 @@ level on, and not the ones below.
 """
 
 import hashlib
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Int64
-from msgspec import Meta
 
-from sagesplat.core.errors import DataError
+from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.core.limits import Count, LabelId, Sha256, Share
+from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import read_ply, write_ply
@@ -36,8 +36,7 @@ STREAM = ".sgst"
 _FORMATS: dict[str, Format] = {STREAM: "stream", ".ply": "ply"}  # by suffix; all others are SPZ
 _FINE_BITS = 8, 8  # of SH coefficients
 _CURE = "delete that folder and run `sagesplat nest` again"
-Size = Annotated[int, Meta(ge=1, le=2**53 - 1)]
-_FileName = Annotated[str, Meta(pattern=r"^(?!\.)[A-Za-z0-9_.-]{1,200}\Z")]
+_FILE_NAME = re.compile(r"(?!\.)[A-Za-z0-9_.-]{1,200}")
 GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
 
 
@@ -46,17 +45,19 @@ class Increment:
     """The Gaussians that a level of a category adds to the level below it, or replaces it by, as bytes."""
 
     label_id: LabelId
-    level: Size
-    uri: _FileName  # in the folder of the index; its name holds a hash, so it can be cached for ever
-    count: Size  # Gaussians
-    nbytes: Size
-    gpu_bytes: Size
+    level: AtLeast1
+    uri: str  # a file name in the folder of the index; its name holds a hash, so it can be cached for ever
+    count: AtLeast1  # Gaussians
+    nbytes: AtLeast1
+    gpu_bytes: AtLeast1
     sha256: Sha256
     refine: Refine = "ADD"  # REPLACE: instead of all increments of lower levels
     offset: Count = 0  # its first byte in the file: a coded stream has all levels of a category
     weight: Share | None = None  # of second opacities where this is the newest level; None: there are none
 
     def __post_init__(self) -> None:
+        if not _FILE_NAME.fullmatch(self.uri):
+            raise ValueError(f"{short(repr(self.uri))} is no file name of an increment")
         if self.offset and self.format != "stream":
             raise ValueError(f"offset {self.offset} in a file of its own")
 

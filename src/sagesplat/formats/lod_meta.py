@@ -27,7 +27,6 @@ LOD_META = "lod-meta.json"
 _MOST_LEVELS = 100
 _CURE = "copy its folder again"
 _Number = Annotated[int, Meta(ge=0, lt=2**40)]
-_Name = Annotated[str, Meta(max_length=1000, pattern=r"^[^\x00-\x1f\x7f\ud800-\udfff]+\Z")]
 
 Slices = dict[int, list[tuple[int, int]]]  # by file: first row and number of rows of each leaf
 
@@ -109,10 +108,15 @@ class _Node:
 @dataclass(frozen=True)
 class _Meta:
     lodLevels: Annotated[int, Meta(ge=1, le=_MOST_LEVELS)]
-    filenames: list[_Name]
+    filenames: list[str]
     tree: _Node
-    environment: _Name | Literal[""] | None = None
+    environment: str | None = None  # None or "": there is none
     version: Literal[1] = 1
+
+    def __post_init__(self) -> None:
+        for name in (*self.filenames, self.environment or "."):
+            if not (0 < len(name) <= 1000 and name.isprintable()):
+                raise ValueError(f"{short(repr(name))} is no file name")
 
 
 def _parsed(path: Path, lod: int) -> tuple[int, list[str], str | None, Slices]:

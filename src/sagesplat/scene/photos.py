@@ -64,7 +64,7 @@ def reconstruct(
     poses.json. Intermediate results are kept in sfm/: a killed run resumes, unless photos or settings
     changed. `device`: of features and matching; `threads`: -1 for all cores.
     The stages of `on_progress` are prepare, features, matches, mapping and undistortion. Raises
-    SceneError, and BackendUnavailable without pycolmap.
+    SceneError, RunError for settings out of range, and BackendUnavailable without pycolmap.
 
     There are no features in pixels that do not count: black in `masks_valid/` below the source, transparent
     (`alpha`, see `SceneConfig`), or `ignored` (the pixels of a photo that label images do not ignore, by the
@@ -125,7 +125,7 @@ def reconstruct(
 
 
 def _check(source: Path, workspace: Path, config: PosesConfig) -> None:
-    """SceneError or BackendUnavailable for what can be rejected before any work."""
+    """An error of `reconstruct` for what can be rejected before any work."""
     if importlib.util.find_spec("pycolmap") is None:
         raise BackendUnavailable(f"poses from photos need pycolmap; {install('sagesplat[poses]')}")
     if not source.exists():

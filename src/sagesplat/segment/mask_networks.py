@@ -10,7 +10,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 from torch import Tensor
 
-from sagesplat.core.errors import BackendUnavailable, RunError
+from sagesplat.core.errors import BackendUnavailable
 from sagesplat.io.typed import known_json
 from sagesplat.segment.detections import Boxes, Found
 from sagesplat.segment.detectors import padded_tokens
@@ -194,7 +194,7 @@ class _Squared:
             self._size = int(size.get("width", side)), int(size.get("height", side))
             self._mean = np.broadcast_to(np.float32(stored.get("image_mean", default[0])), 3)
             self._std = np.broadcast_to(np.float32(stored.get("image_std", default[1])), 3)
-        except (AttributeError, RunError) as error:
+        except AttributeError as error:
             raise ValueError(f"preprocessor_config.json: {error}") from None
 
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"]) -> Float32[Tensor, "1 3 h w"]:

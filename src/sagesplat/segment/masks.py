@@ -23,7 +23,7 @@ UNLABELLED = -1  # pixels, points and Gaussians without a category
 UNLABELLED_NAME = "unlabelled"
 UNLABELLED_COLOR = (128, 128, 128)
 MAX_LABEL_ID = np.iinfo(np.int16).max
-UNKNOWN = -2  # never leaves this file
+_UNKNOWN = -2  # never leaves this file
 CACHE_BYTES = 2**28  # of the images of a folder that are kept in memory
 _BLOCK = len("@4095")  # what a per-block category adds to the name of its category
 VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
@@ -216,8 +216,8 @@ def read_png(
     except PictureError as error:
         if not path.exists():
             raise LabelError(f"{path}: no such file; {cure}") from None
-        reason = f"{error.reason}); {error.cure or 'export it again'}"
-        raise LabelError(f"{path}: not a readable PNG ({reason}") from None
+        cure = error.cure or "export it again"
+        raise LabelError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
     if pixels is None:
         wanted = "an RGB image of segments" if segments else "one channel of 8- or 16-bit ids"
         raise LabelError(f"{path}: a PNG of mode {mode} where {wanted} is needed; convert it")
@@ -261,10 +261,10 @@ def translated(
     """Replace each value by what `ids` says; LabelError for values that it does not know."""
     small = raw.dtype.itemsize <= 2
     size = max(ids) + 2  # the last entry is for all larger values
-    table = np.full(max(size, np.iinfo(raw.dtype).max + 1) if small else size, UNKNOWN, np.int16)
+    table = np.full(max(size, np.iinfo(raw.dtype).max + 1) if small else size, _UNKNOWN, np.int16)
     table[list(ids)] = list(ids.values())
     label_ids = table[raw if small else np.minimum(raw, len(table) - 1)]
-    unknown = raw[label_ids == UNKNOWN]
+    unknown = raw[label_ids == _UNKNOWN]
     if len(unknown):
         unknown = np.unique(unknown[:10_000])  # of a large image some will do
         listed = ", ".join(map(str, unknown[:5])) + (", ..." if len(unknown) > 5 else "")

@@ -15,6 +15,7 @@ from PIL import Image
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import BackendUnavailable, LabelError, short
 from sagesplat.core.extras import install
+from sagesplat.core.limits import LARGEST, Number
 from sagesplat.core.memory import ran_out
 from sagesplat.io.files import read_json
 from sagesplat.io.typed import convert_as, refused
@@ -30,8 +31,7 @@ from sagesplat.segment.segmenters import (
 )
 from sagesplat.segment.taxonomies import SOURCES, to_coco
 
-_Value = Annotated[float, Meta(ge=-1e30, le=1e30)]
-_Scale = Annotated[float, Meta(gt=0, le=1e30)]
+_Scale = Annotated[float, Meta(ge=1e-30, le=LARGEST)]  # not 0 in 32 bits either
 _TIME_LIMIT = 300.0  # seconds that a network may take for a photo
 _PIXELS = 2**24  # of a network's input: 200 MB
 _VALUES = 2**29  # of its output: 2 GB
@@ -63,10 +63,11 @@ def read_classes(path: Path) -> Classes:
         if missing := [name for name in made.classes if name not in ids]:
             raise ValueError(f"no category of {missing[0]!r:.60}")
         mean, std = (np.broadcast_to(np.array(values, np.float32), 3) for values in (made.mean, made.std))
-    pairs = [(UNLABELLED if ids[name] is None else ids[name], name) for name in made.classes]
-    names = {i: coco.NAMES.get(i, name) for i, name in pairs if i is not None and i != UNLABELLED}
+    label_ids = [UNLABELLED if (found := ids[name]) is None else found for name in made.classes]
+    pairs = zip(label_ids, made.classes, strict=True)
+    names = {i: coco.NAMES.get(i, name) for i, name in pairs if i != UNLABELLED}
     taxonomy = taxonomy_of(names, path)  # says which ids do not fit
-    return Classes(np.array([i for i, _ in pairs], np.int16), taxonomy, mean, std)
+    return Classes(np.array(label_ids, np.int16), taxonomy, mean, std)
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class _File:
     classes: list[str]
     coco_panoptic: dict[str, int | None] = field(default_factory=dict)
     vocabulary: str | None = None
-    mean: _Value | list[_Value] = 0.5
+    mean: Number | list[Number] = 0.5
     std: _Scale | list[_Scale] = 0.5
 
 

@@ -10,17 +10,9 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from sagesplat.core.errors import DataError, RunError
-from sagesplat.core.limits import Count, LabelId, Sha256, Share
+from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import repaired
-from sagesplat.formats.increments import (
-    INDEX,
-    Increment,
-    Refine,
-    Size,
-    read_increments,
-    read_index,
-    shown,
-)
+from sagesplat.formats.increments import INDEX, Increment, Refine, read_increments, read_index, shown
 from sagesplat.formats.lod_meta import LOD_META, level_files
 from sagesplat.formats.sog import META
 from sagesplat.formats.splats import Splat, num_lods, read_splat
@@ -98,9 +90,9 @@ class _BundleLevel:
     """A level of a category in a bundle's manifest."""
 
     uri: Annotated[str, Meta(pattern="^chunks/")]
-    count: Size
-    bytes: Size
-    gpuBytes: Size
+    count: AtLeast1
+    bytes: AtLeast1
+    gpuBytes: AtLeast1
     sha256: Sha256
     refine: Refine = "ADD"
     offset: Count = 0
