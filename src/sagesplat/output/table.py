@@ -131,6 +131,7 @@ def _text(value: str | int | float, spec: str) -> str:
 
 
 _TEX = {c: "\\" + c for c in "&%$#_{}"} | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}"}
+_TEX |= {"^": r"\textasciicircum{}", "–": "--", "≥": r"$\geq$", "<": r"$<$", ">": r"$>$", "|": r"$|$"}
 
 
 def _tex(text: str) -> str:
