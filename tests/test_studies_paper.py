@@ -17,6 +17,7 @@ from sagesplat.core.config import (
     PlanConfig,
     RunConfig,
     SampleConfig,
+    SceneConfig,
     TrainConfig,
 )
 from sagesplat.core.errors import RunError
@@ -206,6 +207,16 @@ def test_a_second_report_has_nothing_to_do_and_another_view_needs_force(finished
         paper_report(again, replace(PAPER, lpips=job.run.path / "nowhere", view=job.scene.views[3].name))
 
 
+@pytest.mark.slow
+def test_a_capture_without_test_views(capture, tmp_path):
+    config = replace(CONFIG, scene=SceneConfig(test_every=0), train=TrainConfig(max_steps=20, level_every=10))
+    job, _ = work(tmp_path / "run", capture, config)
+    paper_report(job, replace(PAPER, lpips=tmp_path, tune_steps=0))
+    assert not (job.run.paper / "table_1_test.csv").exists()
+    assert not (job.run.paper / "cross_view.csv").exists()
+    assert set(read_same_size(job.run.same_size).of_view) == {6}
+
+
 def test_early_stopping_beside_a_composition(capture, finished, tmp_path):
     full, _ = finished
     config = replace(CONFIG, train=replace(CONFIG.train, freeze_at=0.45))
@@ -319,7 +330,7 @@ def test_tables_in_markdown_and_latex(tmp_path):
     assert r"\caption{SSIM \& more}" in tex
     assert r"\multicolumn{2}{c}{t=5}" in tex
     assert r"\cmidrule(lr){2-3}" in tex
-    assert r"a\_b|c & \cellcolor{black!10}0.50\textsuperscript{t=0.5} & 1.4M & 50 \% \\" in tex
+    assert r"a\_b$|$c & \cellcolor{black!10}0.50\textsuperscript{t=0.5} & 1.4M & 50 \% \\" in tex
     assert tex.count(r"\\") == 4 + 0
     assert table.only("count", "category").cells() == [["1.4M", "a_b|c"], ["9,400", "d"]]
     table.write(tmp_path / "t")
