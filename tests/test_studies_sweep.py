@@ -140,6 +140,7 @@ def test_cells_that_share_a_training_share_what_later_stages_read(finished, tmp_
         ladder = "snapshots"
         fuse = true
         masks = { segmenter = "hf", model = "some/network" }
+        labels = { ignore = "sky-other-merged" }
         train = { max_steps = 20, level_every = 20 }
         [scenes]
         plot = "capture"
@@ -153,6 +154,7 @@ def test_cells_that_share_a_training_share_what_later_stages_read(finished, tmp_
     assert settings_of(first, "fuse") == settings_of(second, "fuse") == {}
     for path in sorted(p for p in first.fused.rglob("*") if p.is_file()):
         assert (second.path / path.relative_to(first.path)).read_bytes() == path.read_bytes(), path.name
+    assert first.valid.exists()
     # all that was there after training is there again
     later = {"fused", "snapshots", ".lock"}
     assert {p.name for p in first.path.iterdir()} - later == {p.name for p in second.path.iterdir()} - later
