@@ -277,6 +277,26 @@ def trained(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
+def test_training_goes_on_after_a_full_disk(scene: Scene, trained: Path, tmp_path, monkeypatch) -> None:
+    """Full after a random number of bytes, again and again: the result is that of an undisturbed one."""
+    chance, lines = random.Random(4), []
+    while True:
+        with space_for(chance.randrange(90_000), monkeypatch):
+            try:
+                list(training(scene, tmp_path))
+                break
+            except RunError as error:
+                lines.append(str(error))
+        assert temporary(tmp_path) == []
+        if len(lines) == 40:  # a disk that never has room for one checkpoint
+            list(training(scene, tmp_path))
+            break
+    assert len(lines) >= 5
+    assert all(re.search(FULL, line) for line in lines)
+    assert content(tmp_path) == content(trained)
+
+
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "capture"

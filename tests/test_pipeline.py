@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from conftest import DemoRun
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan_files import read_plans
-from sagesplat.core.config import PlanConfig, RunConfig
+from sagesplat.core.config import FitConfig, PlanConfig, RunConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, RunDone, StageDone, StageSkipped
 from sagesplat.formats.ply import read_ply
@@ -105,6 +106,23 @@ def test_other_settings_need_force_and_redo_only_what_depends_on_them(
     with pytest.raises(RunError, match=r"plan\.json: made with other .*--force"):
         work(run, capture, other)
     assert named(work(run, capture, other, force=True), StageDone) == PLANNED
+
+
+@pytest.mark.parametrize(
+    ("changes", "option"),
+    [
+        ({"plan": PlanConfig(target_ssim=1.5)}, "--target-ssim 1.5"),
+        ({"scene": SceneConfig(downscale=-1)}, "--downscale -1"),
+        ({"train": TrainConfig(max_steps=0)}, "--train.max-steps 0"),
+        ({"fit": FitConfig(confidence=1.0)}, "--fit.confidence 1.0"),
+    ],
+)
+def test_impossible_settings_are_refused_by_their_options_before_anything_is_made(
+    capture: Path, tmp_path: Path, changes: dict[str, Any], option: str
+) -> None:
+    with pytest.raises(RunError, match=f"^{option} is impossible; choose"):
+        work(tmp_path / "run", capture, RunConfig(**changes))
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_folder_of_another_scene_is_refused(

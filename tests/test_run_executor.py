@@ -208,6 +208,14 @@ def test_tasks_of_one_process_share_the_scene_and_the_photos(finished: Path) -> 
     assert replace(opened, run=RunDir(finished, "snapshots")).photos is job.photos
 
 
+def test_what_an_executor_has_decides_what_tasks_compute_with(tmp_path: Path) -> None:
+    executor = Shuffled()
+    executor.backend, executor.memory = "cuda", 5 * 10**9
+    job = Job(RunDir(tmp_path), lambda event: None, "cpu", executor=executor)
+    assert (job.spec.backend, job.spec.memory_limit, job.gpus) == ("cuda", 5 * 10**9, 1)
+    assert replace(job, memory_limit=10**9).spec.memory_limit == 10**9
+
+
 def test_a_capture_that_a_node_does_not_see_is_one_line(finished: Path, tmp_path: Path) -> None:
     job, _ = again(finished, tmp_path / "run", Shuffled())
     text = job.run.scene.read_text()

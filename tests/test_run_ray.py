@@ -21,7 +21,7 @@ pytest.importorskip("ray")
 
 import ray
 from ray.cluster_utils import Cluster
-from ray_tasks import die, divide, hold, where
+from ray_tasks import die, divide, fail, hold, where
 
 from sagesplat.cli.base import Machine, computing
 from sagesplat.core.config import FitConfig, MasksConfig, SceneConfig, TrainConfig
@@ -88,6 +88,36 @@ def test_tasks_are_spread_over_the_nodes_and_tell_what_they_do(executor: RayExec
     bar = [event for event in events if isinstance(event, Progress)]
     assert bar[-1] == Progress("where", 8, 8)
     assert [event.done for event in bar] == sorted(event.done for event in bar)
+
+
+@pytest.mark.slow
+def test_an_error_of_the_user_is_its_line_and_ends_the_others(executor: RayExecutor, tmp_path: Path) -> None:
+    tasks = [Task("fail", fail, (number, tmp_path)) for number in range(4)]
+    with pytest.raises(RunError, match=f"^{tmp_path}: mend it$") as raised:
+        results(executor, tasks, lambda event: None)
+    assert raised.value.__cause__ is None
+    assert results(executor, [Task("divide", divide, (4,))], lambda event: None) == [
+        0.25
+    ]  # nobody is at work
+    assert not [path for path in tmp_path.iterdir() if path.name.isdigit()]
+
+
+@pytest.mark.slow
+def test_a_fault_of_ours_keeps_its_traceback(executor: RayExecutor) -> None:
+    with pytest.raises(ZeroDivisionError) as raised:
+        results(executor, [Task("divide", divide, (0,))], lambda event: None)
+    assert "return 1 / number" in str(raised.value.__cause__)
+
+
+@pytest.mark.slow
+def test_a_task_on_a_gpu_takes_its_share_of_the_cpus(cluster: Any, tmp_path: Path, monkeypatch) -> None:
+    nodes = [{"CPU": 16.0, "GPU": 4.0, "memory": 64e9}, {"CPU": 8.0, "memory": 8e9}]
+    monkeypatch.setattr(RayExecutor, "_nodes", lambda self: nodes)
+    on_gpus, on_cpus = RayExecutor(tmp_path, 16, gpus=1), RayExecutor(tmp_path, 4)
+    assert (on_gpus.parallel, on_gpus.memory) == (4, 16 * 10**9)
+    assert (on_cpus.parallel, on_cpus.memory) == (6, 4 * 10**9)
+    with pytest.raises(RunError, match=r"has 32 CPUs \(most CPUs: 16\); use --threads 16"):
+        results(RayExecutor(tmp_path, 32), [Task("divide", divide, (1,))], lambda event: None)
 
 
 @pytest.mark.slow

@@ -3,8 +3,16 @@
 import ast
 from pathlib import Path
 
+import pytest
+
 import sagesplat
-from sagesplat.run.stage_table import STAGES, following, needed_for, stage_kind
+from sagesplat import cli
+from sagesplat.core.errors import RunError
+from sagesplat.run.job import Job
+from sagesplat.run.records import settings_of
+from sagesplat.run.run_dir import RunDir
+from sagesplat.run.stage import run_stage
+from sagesplat.run.stage_table import STAGES, command_of, following, needed_for, stage_kind
 
 
 def names_in_calls() -> set[str]:
@@ -37,3 +45,20 @@ def test_what_follows() -> None:
     assert following("pruned-0.5-600") == ["compare", "compared"]
     assert "scene" not in needed_for("scene") | needed_for("adopt") | needed_for("poses")
     assert stage_kind("mcmc-0.2") is STAGES["mcmc"]
+
+
+def test_the_command_of_a_stage_can_be_typed() -> None:
+    commands = {name: command_of(name).split() for name in STAGES}
+    assert all(words[0] == "sagesplat" and words[1] in cli.commands() for words in commands.values())
+    assert commands["block_categories"] == ["sagesplat", "block-categories"]
+    assert command_of("pruned-0.5-600") == "sagesplat compare"
+    assert command_of("paper") == "sagesplat report --paper"
+
+
+def test_a_missing_input_names_a_command(tmp_path: Path) -> None:
+    job = Job(RunDir(tmp_path), print)
+    job.run.scene.touch()
+    with pytest.raises(RunError, match=r"levels: missing; run what comes before `sagesplat nest`, or"):
+        run_stage(job, "base", {}, [job.run.levels], [job.run.base_model], list)
+    with pytest.raises(RunError, match="stage scene is not done; run `sagesplat masks` or `sagesplat run`"):
+        settings_of(job.run, "scene")

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import random_gaussians
 from PIL import Image
 from test_viewer_bundle import manifest_of, own_views
 
@@ -20,7 +19,7 @@ from sagesplat.formats.spz import read_spz
 from sagesplat.io.files import read_json, write_json
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
-from sagesplat.run.records import FORMAT, checkpoint_key, input_hashes
+from sagesplat.run.records import FORMAT, input_hashes
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.display_colors import colors_of
 from sagesplat.stages.bundle import BundleMade, bundle
@@ -29,10 +28,9 @@ from sagesplat.stages.live_bundle import live_bundle, trains_antialiased
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import increments_of
+from sagesplat.stages.train import write_cap
 from sagesplat.stages.view import run_bundle
 from sagesplat.studies.measure.levels import levels_of
-from sagesplat.train.checkpoint import write_checkpoint
-from sagesplat.train.state import initial_state
 from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import is_bundle
 from sagesplat.viewer.frames import camera_at
@@ -132,6 +130,17 @@ def test_promises_survive_the_bundle(bundled: tuple[Job, BundleMade], quality: Q
         np.testing.assert_array_equal(np.isnan(told.bound), np.isnan(kept.bound))
 
 
+def test_the_same_run_gives_the_same_bytes(bundled: tuple[Job, BundleMade], tmp_path: Path) -> None:
+    job, made = bundled
+    settings = {"meters_per_unit": 2.0, "always": ["car"], "weights": {"car": 3}}
+    for _ in range(2):  # into a new folder, and over the earlier one
+        bundle(job, tmp_path / "out", viewer=made.path.parent / "viewer", **settings)
+    files = {path.relative_to(made.path) for path in made.path.rglob("*") if path.is_file()}
+    assert {p.relative_to(tmp_path / "out") for p in (tmp_path / "out").rglob("*") if p.is_file()} == files
+    for name in files:
+        assert (tmp_path / "out" / name).read_bytes() == (made.path / name).read_bytes(), name
+
+
 def test_a_finished_run_is_shown_without_its_capture(run: Path, tmp_path: Path, viewer: Path) -> None:
     """The run keeps the cameras and points; the photos are needed by nothing that a bundle shows."""
     made = bundle(job_of(run), tmp_path / "before", viewer=viewer)
@@ -201,12 +210,18 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
     assert not out.exists()
 
 
+def test_promises_of_other_chunks(run: Path, tmp_path: Path, viewer: Path) -> None:
+    index = run / "nested" / "increments" / "index.json"
+    index.write_text(index.read_text() + "\n")
+    with pytest.raises(RunError, match="fitted to other increments; run `sagesplat fit`"):
+        bundle(job_of(run), tmp_path / "out", viewer=viewer)
+
+
 def test_a_training_that_goes_on_says_how_its_gaussians_are_drawn(tmp_path: Path) -> None:
     job = job_of(tmp_path)
-    assert not trains_antialiased(job)  # no checkpoint yet
+    assert not trains_antialiased(job)  # nothing has begun
     for antialiased in (True, False):
-        key = checkpoint_key(job.run, {"antialiased": antialiased}, [])
-        write_checkpoint(job.run.checkpoint, initial_state(random_gaussians(9), 0), key)
+        write_cap(job.run.cap, 0, {"antialiased": antialiased, "seed": 3})
         assert trains_antialiased(job) is antialiased
 
 
@@ -255,6 +270,36 @@ def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: P
     assert there >= uris[1] | uris[2]
     assert not there & (uris[0] - uris[1] - uris[2])
     assert not (folder / ".chunks").exists()
+
+
+def test_a_live_bundle_leaves_other_folders_alone(run: Path, tmp_path: Path, viewer: Path) -> None:
+    other = tmp_path / "photos"
+    other.mkdir()
+    (other / "a.jpg").write_text("x")
+    with pytest.raises(RunError, match="neither empty nor a bundle"):
+        live_bundle(job_of(run), other, viewer)
+    assert [path.name for path in other.iterdir()] == ["a.jpg"]
+
+
+def test_a_live_bundle_that_was_killed_before_its_manifest_goes_on(
+    run: Path, tmp_path: Path, viewer: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (viewer / "assets").mkdir()
+    (viewer / "assets" / "a.js").write_text("1")
+
+    def killed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    folder = tmp_path / "live"
+    for name in ("shutil.copytree", "write_text", "write_increments", "write_documents"):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"sagesplat.stages.live_bundle.{name}", killed)
+            with pytest.raises(KeyboardInterrupt):
+                live_bundle(job_of(run), folder, viewer)
+    assert live_bundle(job_of(run), folder, viewer)
+    assert is_bundle(folder)
+    assert (folder / "assets" / "a.js").read_text() == "1"
+    assert not live_bundle(job_of(run), folder, viewer)
 
 
 def test_colours_are_distinct_and_stay() -> None:

@@ -13,6 +13,7 @@ from sagesplat.core.config import BlocksConfig, CleanConfig
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped
 from sagesplat.formats.levels import read_header, read_level, select_level, write_level
+from sagesplat.io.files import write_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.block_levels import nest_scene
@@ -97,6 +98,15 @@ def test_another_training_is_cleaned_anew(run: RunDir) -> None:
         path.write_bytes(b"of this training")
     train_scene(job_of(run, force=True), replace(SMALL_RUN.train, max_steps=4), BlocksConfig(), 0)
     assert not any(path.exists() for path in made)
+
+
+def test_a_scene_in_blocks_and_an_adopted_splat_are_refused(run: RunDir) -> None:
+    write_json(run.division, {})
+    with pytest.raises(RunError, match=r"blocks: floaters are not removed from a scene in blocks"):
+        clean_levels(job_of(run), CleanConfig())
+    run.adopted.write_bytes(b"")
+    with pytest.raises(RunError, match=r"a splat that was trained elsewhere"):
+        clean_levels(job_of(run), CleanConfig())
 
 
 def test_a_level_is_selected_as_it_is_stored(run: RunDir, tmp_path: Path) -> None:

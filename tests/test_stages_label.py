@@ -136,6 +136,12 @@ def test_photos_without_poses_become_a_capture(
     assert len(job.scene.views) == 8
 
 
+def test_a_run_among_the_photos_is_refused(capture: Path) -> None:
+    job = Job(RunDir(capture / "images" / "run"), lambda event: None)
+    with pytest.raises(RunError, match="lies among the photos"):
+        open_scene(job, capture / "images", SceneConfig())
+
+
 def valid_in(job: Job) -> list[np.ndarray | None]:
     return [job.valid[view] for view in job.scene.views]
 

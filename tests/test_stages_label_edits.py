@@ -265,6 +265,15 @@ def test_edits_of_another_run(run: Path, viewer: Path) -> None:
         apply_labels(job_of(run), viewer=viewer)
 
 
+def test_other_folders_are_left_alone(run: Path, viewer: Path, tmp_path: Path) -> None:
+    (tmp_path / "run-edited").mkdir()
+    (tmp_path / "run-edited" / "mine.txt").write_text("mine")
+    with pytest.raises(RunError, match="neither empty nor an edited run"):
+        edited(run, viewer, Rename(CAR, "auto"))
+    with pytest.raises(RunError, match="the run itself"):
+        apply_labels(job_of(run), out=run, viewer=viewer)
+
+
 @pytest.mark.slow
 def test_instances_keep_their_category_through_edits(tmp_path: Path, viewer: Path) -> None:
     make_capture(tmp_path / "capture", views=16, width=80, height=60)

@@ -13,6 +13,7 @@ from sagesplat.adapt.fidelity import measure_compositions, measure_levels
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.adapt.viewpoints import Rule, draw, read_viewpoints
 from sagesplat.core.config import FitConfig, SampleConfig
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone, StageSkipped
 from sagesplat.metrics.image import ssim_map
 from sagesplat.raster import rasterize
@@ -106,6 +107,17 @@ def test_own_viewpoints(job: Job, tmp_path: Path):
     drawn = read_viewpoints(job.run.viewpoints)
     assert drawn.source == "path.json"
     assert all(np.abs(c.w2c - camera.w2c).max() < 1e-6 for c in drawn.cameras)
+
+
+def test_viewpoints_that_see_nothing_are_one_line(job: Job, tmp_path: Path):
+    away = np.eye(4)
+    away[:3, 3] = [0, 0, 1000]
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"frames": [{"transform_matrix": (away * [1, -1, -1, 1]).tolist()}]}))
+    before = job.run.sampled.read_bytes()
+    with pytest.raises(RunError, match=r"none of 6 viewpoints shows anything of the scene.*--sample\.shift"):
+        again(job, replace(FEW, viewpoints=path))
+    assert job.run.sampled.read_bytes() == before
 
 
 def test_numbers_follow_the_length_of_the_training(job: Job, monkeypatch: pytest.MonkeyPatch):

@@ -12,7 +12,7 @@ from sagesplat.raster import Backend
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import scene as scene_stage
-from sagesplat.stages.scene import open_scene
+from sagesplat.stages.scene import cpu_downscale, open_scene
 
 
 def begin(
@@ -54,3 +54,10 @@ def test_a_run_keeps_the_factor_that_it_began_with(capture: Path, monkeypatch: p
     monkeypatch.setattr(scene_stage, "_CPU_PIXELS", 1e9)
     assert begin(capture) == ([], 4)
     assert begin(capture, backend="cuda") == ([], 4)
+
+
+def test_the_factor_grows_with_the_photos() -> None:
+    sizes = [(512, 512), (1280, 960), (1920, 1080), (3000, 3000), (5187, 3361)]
+    factors = [cpu_downscale(float(width * height)) for width, height in sizes]
+    assert factors == [1, 1, 2, 4, 4]
+    assert cpu_downscale(1e9) == 8

@@ -17,6 +17,7 @@ from sagesplat.core.config import (
     PlanConfig,
     RunConfig,
     SampleConfig,
+    SceneConfig,
     TrainConfig,
 )
 from sagesplat.core.errors import RunError
@@ -204,6 +205,16 @@ def test_a_second_report_has_nothing_to_do_and_another_view_needs_force(finished
         paper_report(again, replace(PAPER, view="nothing"))
     with pytest.raises(RunError, match=r"same_size\.csv: made with other .*--force"):
         paper_report(again, replace(PAPER, lpips=job.run.path / "nowhere", view=job.scene.views[3].name))
+
+
+@pytest.mark.slow
+def test_a_capture_without_test_views(capture, tmp_path):
+    config = replace(CONFIG, scene=SceneConfig(test_every=0), train=TrainConfig(max_steps=20, level_every=10))
+    job, _ = work(tmp_path / "run", capture, config)
+    paper_report(job, replace(PAPER, lpips=tmp_path, tune_steps=0))
+    assert not (job.run.paper / "table_1_test.csv").exists()
+    assert not (job.run.paper / "cross_view.csv").exists()
+    assert set(read_same_size(job.run.same_size).of_view) == {6}
 
 
 def test_early_stopping_beside_a_composition(capture, finished, tmp_path):

@@ -16,15 +16,16 @@ from sagesplat.core.config import MasksConfig, PlanConfig, RunConfig, SceneConfi
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, TableMade, Training, Warned
 from sagesplat.demo.capture import make_capture
-from sagesplat.io.files import link
+from sagesplat.io.files import link, write_text
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment import hf
 from sagesplat.studies.sweep import run
 from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.studies.sweep.report import MEASURES, Row, readable, summarise
-from sagesplat.studies.sweep.run import _share_training, run_sweep
+from sagesplat.studies.sweep.run import _share_training, _trained_alike, run_sweep
 
+ROOT = Path(__file__).parents[1]
 TEXT = """
 targets = [0.4, 0.3]
 seeds = [0, 5]
@@ -139,6 +140,7 @@ def test_cells_that_share_a_training_share_what_later_stages_read(finished, tmp_
         ladder = "snapshots"
         fuse = true
         masks = { segmenter = "hf", model = "some/network" }
+        labels = { ignore = "sky-other-merged" }
         train = { max_steps = 20, level_every = 20 }
         [scenes]
         plot = "capture"
@@ -152,6 +154,7 @@ def test_cells_that_share_a_training_share_what_later_stages_read(finished, tmp_
     assert settings_of(first, "fuse") == settings_of(second, "fuse") == {}
     for path in sorted(p for p in first.fused.rglob("*") if p.is_file()):
         assert (second.path / path.relative_to(first.path)).read_bytes() == path.read_bytes(), path.name
+    assert first.valid.exists()
     # all that was there after training is there again
     later = {"fused", "snapshots", ".lock"}
     assert {p.name for p in first.path.iterdir()} - later == {p.name for p in second.path.iterdir()} - later
@@ -178,6 +181,20 @@ def test_a_shared_training_is_there_as_a_whole_or_not_at_all(copy: Path, monkeyp
     _share_training(runs, like, new)
     assert RunDir(runs / new.name).provenance("train").exists()
     assert RunDir(runs / new.name).cameras.read_bytes() == b"refined"
+
+
+def test_blocks_are_trained_by_each_cell(tmp_path: Path) -> None:
+    text = "targets = [0.4]\nseeds = [0]\nscenes.plot = 'demo'\nvariants.whole = {}\n"
+    text += "variants.two.blocks.count = 2\n"
+    text += "variants.near.blocks.count = 2\nvariants.near.fit.distance = 'minimum'\n"
+    whole, two, near = read_sweep(write(tmp_path, text))
+    assert _trained_alike([whole], two) is None
+    assert _trained_alike([whole, two], near) == two
+    made = RunDir(tmp_path / two.name)
+    made.blocks.mkdir(parents=True)
+    write_text(made.provenance("train"), "{}")
+    _share_training(tmp_path, two, near)  # what is in a block's folder names that folder
+    assert not (tmp_path / near.name).exists()
 
 
 def test_a_cell_that_fails_is_recorded_and_the_others_go_on(copy: Path) -> None:
@@ -226,6 +243,13 @@ def test_an_interrupted_sweep_keeps_what_is_done(copy: Path) -> None:
     assert {row["seed"] for row in rows_of(copy / "out" / "cells.csv")} == {"0"}
 
 
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    sweep = read_sweep(write(tmp_path, TEXT))
+    with pytest.raises(RunError, match="not empty and not the folder of a sweep"):
+        run_sweep(sweep, tmp_path, print)
+    assert {path.name for path in tmp_path.iterdir()} == {"capture", "sweep.toml"}
+
+
 def test_settings_and_variants_become_the_configuration_of_each_cell(tmp_path: Path) -> None:
     text = """
         targets = [0.9, 0.5, 1]
@@ -259,6 +283,20 @@ def test_settings_and_variants_become_the_configuration_of_each_cell(tmp_path: P
     assert plot.config.plan.targets == [0.5, 0.9, 1.0]
 
 
+def test_without_variants_a_cell_is_a_scene_and_a_seed(tmp_path: Path) -> None:
+    text = 'targets = [0.8]\nseeds = [0, 1]\nscenes.plot = "capture"'
+    sweep = read_sweep(write(tmp_path, text))
+    assert [cell.name for cell in sweep] == ["plot-seed0", "plot-seed1"]
+    assert [cell.config for cell in sweep] == [
+        RunConfig(plan=PlanConfig(target_ssim=0.8, other_targets=()), seed=seed) for seed in (0, 1)
+    ]
+
+
+def test_the_example_is_a_sweep() -> None:
+    sweep = read_sweep(ROOT / "examples" / "sweep.toml")
+    assert {cell.capture for cell in sweep} == {None}
+
+
 HEAD = 'targets = [0.8]\nseeds = [0]\nscenes.plot = "capture"\n'
 
 
@@ -268,11 +306,13 @@ HEAD = 'targets = [0.8]\nseeds = [0]\nscenes.plot = "capture"\n'
         ("targets = [", "not readable as TOML"),
         (HEAD + '"a\\nb" = 1', r"'a\\nb': no such key; there are targets, seeds"),
         (HEAD + "settings.train.steps = 1", r"settings\.train\.'steps': no such key; there are max_steps"),
-        (HEAD + "settings.train.max_steps = -5", r"train\.max_steps: expected int >= 1"),
+        (HEAD + "settings.train.max_steps = -5", r"settings\.train\.max_steps: expected int >= 1"),
         (HEAD + "settings.masks.masks = 3", r"masks\.masks: 3 is no path"),
         (HEAD + "settings.seed = 1", r"settings\.seed: set by the list seeds"),
         (HEAD + "variants.a.plan.other_targets = [1]", r"variants\.a\.plan\.other_targets: set by the list"),
-        (HEAD + "variants.'a/b' = {}", "variants: expected str matching"),
+        (HEAD + "variants.'a/b' = {}", "the name 'a/b' makes no folder; use letters"),
+        (HEAD + "scenes.'..' = 'capture'", r"the name '\.\.' makes no folder"),
+        (HEAD + "variants.a.train.max_steps = 0.5", r"variants\.a\.train\.max_steps: expected int"),
         (HEAD + "scenes.Plot = 'capture'", "two runs would be called plot-seed0"),
         (HEAD + "scenes.other = 'nowhere'", r"scenes\.other: no folder .*nowhere"),
         (HEAD.replace("scenes.plot", "#"), "missing required field scenes"),

@@ -24,6 +24,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.scene import open_scene
+from sagesplat.studies.transfer.report import headline, summary_table, transfer_figure
 from sagesplat.studies.transfer.run import load_fitted
 from sagesplat.studies.transfer.run import transfer as transfer_runs
 from sagesplat.studies.transfer.score import (
@@ -153,6 +154,26 @@ def test_levels_are_matched_by_their_share_of_the_run():
     assert shared_categories(replace(A, recovering=frozenset(LEVELS)), b)[0].matched == (100, 200, 300)
 
 
+def test_a_category_without_test_views_and_one_in_two_views():
+    rows = A.observations
+    no_test = A.test_views[:, None] == rows.view
+    few = np.isin(rows.view, (0, 3))
+    b = replace(A, observations=rows.select(np.where(rows.label_id == 1, ~no_test.any(0), few)))
+    scores = transfer(A, b, [0.7])
+    apple, bench = (
+        scores.select((scores.category == n) & (scores.predictor == "raw")) for n in ("apple", "bench")
+    )
+    assert (apple.views.tolist(), bench.views.tolist()) == ([14, 0], [1, 1])
+    assert np.isfinite(apple.ssim_error[0] + bench.ssim_error).all()
+    for name in ("ssim_error", "bias", "outside", "iteration_error", "hit", "regret", "regret_share"):
+        assert math.isnan(getattr(apple, name)[1])
+    assert (apple.reachable[1], apple.missed[1]) == (0, 0)
+    assert "on test views" in headline(summary_table(scores))
+    alone = replace(b, test_views=b.test_views[:0])
+    assert "on train views" in headline(summary_table(transfer(A, alone, [0.7])))
+    transfer_figure(A, b)
+
+
 def test_levels_that_another_runs_models_choose_for_a_view():
     b = synthetic("b", {7: "apple", 9: "else"}, unit=3.0)  # all of B's distances are three times A's
     view = int(b.test_views[0])
@@ -162,6 +183,17 @@ def test_levels_that_another_runs_models_choose_for_a_view():
         own = plan_view(b.models, b.counts, here, target, view).levels
         levels = transferred_levels(A, b, view, here, target, "extent")
         assert levels == {7: own[7]}  # `else` is not shared
+
+
+def test_what_is_not_known_is_predicted_by_the_median():
+    b = replace(A, extent=math.nan, spacings={1: 0.01})
+    scores = transfer(A, b, [0.7])
+    blind = np.isin(scores.predictor, ["extent", "median"]) | (
+        (scores.predictor == "footprint") & (scores.category == "bench")
+    )
+    assert (scores.outside == np.where(blind, 1.0, 0.0)).all()
+    assert (scores.ssim_error[blind] > 0.05).all()
+    assert (scores.ssim_error[~blind] < 1e-6).all()
 
 
 def test_scores_by_hand():
@@ -197,6 +229,21 @@ def test_the_choice_is_the_planners(ladder, target):
         }
         plan = plan_view(models, dict(zip(models, counts.tolist(), strict=True)), {}, target, 0)
         assert plan.levels == {1: chosen[view]}
+
+
+@given(st.lists(ladders, min_size=1, max_size=4).filter(lambda x: len({len(i) for i in x}) == 1), ssims)
+def test_regret_is_never_negative_and_hit_is_a_share(views, target):
+    counts = np.array([count for count, _, _ in views[0]])
+    predicted, measured = (np.array([[row[k] for row in view] for view in views]).T for k in (1, 2))
+    result = score(predicted, measured, np.arange(len(counts)), counts, target)
+    assert not result["regret"] < 0  # or NaN
+    assert not result["hit"] < 0
+    assert not result["hit"] > 1
+    assert 0 <= result["missed"] <= result["reachable"] <= len(views)
+    perfect = score(measured, measured, np.arange(len(counts)), counts, target)
+    assert perfect["missed"] == 0
+    assert not perfect["regret"] > 0
+    assert not perfect["iteration_error"] > 0
 
 
 def test_spacing_is_to_the_nearest_point_of_the_same_label():

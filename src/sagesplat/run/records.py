@@ -15,7 +15,7 @@ from sagesplat.core.limits import NotNegative, Number, Seed
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.typed import convert_as, refused
 from sagesplat.run.run_dir import RunDir
-from sagesplat.run.stage_table import STAGES
+from sagesplat.run.stage_table import STAGES, command_of
 
 FORMAT = 3  # of the run folder; raised when older folders can no longer be read
 
@@ -166,7 +166,7 @@ def uses(run: RunDir, stage: str, path: Path) -> bool:
 
 def _record_of(run: RunDir, stage: str) -> dict[str, Any]:
     if not run.provenance(stage).exists():
-        raise RunError(f"{run.path}: stage {stage} is not done; run `sagesplat {stage}` or `sagesplat run`")
+        raise RunError(f"{run.path}: stage {stage} is not done; run `{command_of(stage)}` or `sagesplat run`")
     return read_record(run.provenance(stage))
 
 

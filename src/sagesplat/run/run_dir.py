@@ -61,7 +61,6 @@ class RunDir:
     segmented = _In("segmented")  # as they came, before categories were merged or left out
     segmentation = _In("options.json", "segmented")  # how those were asked for
     given = _In("given")  # those that were given, where prompts are painted over them
-    soft = _In("soft")  # a network's probabilities, of the categories in `segmented`
     masks = _In("masks")  # at training size, with labels.json
     valid = _In("valid")  # which pixels count, by view: images of the views with some that do not
     labels = _In("labels.npz")  # labels of the SfM points

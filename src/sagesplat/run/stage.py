@@ -15,7 +15,7 @@ from sagesplat.io.files import named_full_disk, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
 from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.records import is_done, read_record, record
-from sagesplat.run.stage_table import needed_for, stage_kind
+from sagesplat.run.stage_table import command_of, needed_for, stage_kind
 
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time
 
@@ -94,8 +94,8 @@ def _is_done(job: Job, stage: Stage) -> bool:
         raise RunError(f"{job.run.path}: {NO_RUN}")
     for path in stage.inputs:
         if not path.exists():
-            command = stage.name.replace("_", "-")
-            raise RunError(f"{path}: missing; run the stage before `sagesplat {command}`, or `sagesplat run`")
+            after = command_of(stage.name)
+            raise RunError(f"{path}: missing; run what comes before `{after}`, or `sagesplat run`")
     what = job.run, stage.name, stage.settings, stage.inputs, stage.outputs
     if is_done(*what, job.force or _follows(job, stage)):
         job.emit(StageSkipped(stage.name))

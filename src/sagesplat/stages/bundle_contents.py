@@ -24,7 +24,7 @@ def bundle_contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
     split_names = {i: category_and_block(job, names[i]) for i in labels}
     colors = category_colors(job, {category for category, _ in split_names.values()})
     ground = [i for i in labels if _GROUND & set(_title(job, split_names[i][0]).split())]
-    places = _places(job, g)
+    places, parents = _places(job, g), job.parents
     return Contents(
         name=scene.name,
         extent=scene.extent,
@@ -39,7 +39,7 @@ def bundle_contents(job: Job, g: Gaussians, antialiased: bool) -> Contents:
                 colors[category],
                 boxes.split_boxes(places[i] * FLIP),
                 block=block,
-                parent=job.parents.get(category),
+                parent=parents.get(category),
             )
             for i, (category, block) in split_names.items()
         ],

@@ -169,7 +169,7 @@ def _segment(job: Job, config: MasksConfig, kind: str, *, instances: bool = Fals
         settings["given"] = file_hash(run.given)
         inputs.append(run.given / "labels.json")
     elif instances and SEGMENTERS[kind].instances is not None:
-        settings["instances"] = True  # only then: earlier runs know of no such setting
+        settings["instances"] = True
 
     def make() -> list[str]:
         marker, key = run.segmented / _MARKER, {**settings, "scene": file_hash(run.scene)}

@@ -7,18 +7,16 @@ from typing import Any
 
 import torch
 
-from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import write_increments
 from sagesplat.formats.levels import read_level
-from sagesplat.io.files import write_json
+from sagesplat.io.files import write_json, write_text
 from sagesplat.io.lock import alone
-from sagesplat.io.npz import Npz
-from sagesplat.io.typed import known_json, parse_json_as
+from sagesplat.io.typed import known_json
 from sagesplat.run.job import Job
-from sagesplat.run.records import settings_of
+from sagesplat.run.recorded import recorded_settings
 from sagesplat.stages.bundle_contents import bundle_contents
-from sagesplat.viewer.built import check_viewer, has_viewer, package_viewer
+from sagesplat.viewer.built import PAGE, check_viewer, has_viewer, package_viewer
 from sagesplat.viewer.bundle import MANIFEST, check_target, write_documents
 
 _OTHERS = 10.0  # seconds to wait for another process that writes the same live bundle
@@ -38,18 +36,20 @@ def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
 
 
 def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
-    steps = sorted(p for p in job.run.levels.glob("*.npz") if not p.name.startswith("."))
+    steps = sorted(job.run.levels.glob("[!.]*.npz"))
     if not steps:
         raise RunError(f"{job.run.levels}: no level yet; wait, or run `sagesplat train`")
     newest = {"level": steps[-1].name, "written": steps[-1].stat().st_mtime_ns}
     previous = read_live(folder / _LIVE)
     if previous and previous.of == newest and (folder / MANIFEST).exists():
         return False
+    check_viewer(viewer)
     if not previous:
         check_target(folder)
-    if not has_viewer(folder, viewer):  # none yet, or that of an older version
-        check_viewer(viewer)
-        shutil.copytree(viewer, folder, dirs_exist_ok=True)
+        write_json(folder / _LIVE, {})  # where this one is killed, the next one knows the folder as its own
+    if not has_viewer(folder, viewer):  # none yet, or that of another version; its page comes last
+        shutil.copytree(viewer, folder, ignore=shutil.ignore_patterns(PAGE), dirs_exist_ok=True)
+        write_text(folder / PAGE, (viewer / PAGE).read_text(encoding="utf-8"))
     g = read_level(steps[-1])
     g = g.select(torch.argsort(g.label_ids, stable=True))
     antialiased = trains_antialiased(job)
@@ -83,27 +83,7 @@ def read_live(path: Path) -> Live | None:
     return known_json(path, Live)
 
 
-@dataclass(frozen=True)
-class _Meta:
-    """Of a checkpoint what it belongs to, as JSON of its own."""
-
-    settings: str
-
-
-@dataclass(frozen=True)
-class _Key:
-    settings: TrainConfig
-
-
 def trains_antialiased(job: Job) -> bool:
-    """Whether the run trains with antialiasing; read from the checkpoint while training runs."""
-    try:
-        return bool(settings_of(job.run, "train")["antialiased"])
-    except RunError:
-        pass
-    try:
-        with Npz(job.run.checkpoint) as file:
-            meta = parse_json_as(str(file["meta"]), _Meta)
-            return parse_json_as(meta.settings, _Key).settings.antialiased
-    except (OSError, ValueError, KeyError):
-        return False  # no checkpoint yet, or a damaged one
+    """Whether the run trains with antialiasing, as far as it says so by now."""
+    train = recorded_settings(job.run).get("train")
+    return train is not None and train.antialiased

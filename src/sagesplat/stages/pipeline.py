@@ -59,7 +59,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     Results for the paper's levels or for the nested ladder go to folders of their own: `job.run.ladder`.
     """
     check_not_adopted(job.run)
-    check_limits(config)  # before hours of training
+    _check_limits(config)  # before hours of training
     check_targets(config.plan, config.ladder)
     if config.labels.instances and not method_of(job).has_instances:
         raise RunError("--labels.instances: these levels have no instances; use --ladder nested")
@@ -93,12 +93,19 @@ def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> No
 
     `source`: the splat file, or the folder of a SOG. Of `config` training and nesting are not used.
     """
-    check_limits(config)
+    _check_limits(config)
     check_targets(config.plan, "nested")
     open_splat(job, source, adopted, config.scene, config.masks, config.labels)
     method_of(job).check(config.plan)
     make_levels(job, adopted)
     measure_and_plan(job, config)
+
+
+def _check_limits(config: RunConfig) -> None:
+    """RunError, naming the option, for a setting that is not within its limits."""
+    for unprefixed in (config.scene, config.masks, config.plan):
+        check_limits(unprefixed)
+    check_limits(config)
 
 
 def measure_and_plan(job: Job, config: RunConfig) -> None:

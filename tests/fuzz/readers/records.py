@@ -59,7 +59,7 @@ from tests.fuzz.readers.making import (
     written,
     written_by,
 )
-from tests.fuzz.readers.splats import CHUNK, checkpoints
+from tests.fuzz.readers.splats import CHUNK
 
 MEASURED = dict.fromkeys(("plain", "exposed", "cc"), 20.5)
 FIGURES = {
@@ -298,11 +298,6 @@ def _read_manifest(path: Path) -> None:
     view._is_current(RunDir(path.parent / "run"), path.parent)
 
 
-def _read_begun(path: Path) -> None:
-    """A checkpoint, from which a bundle of a training reads one setting."""
-    live_bundle.trains_antialiased(Job(RunDir(path.parent), _ignore))
-
-
 def _label_edits(folder: Path, size: int) -> list[bytes]:
     listed = [label_edits.Rename("sky", f"sky {i}") for i in range(size)]
     more = (
@@ -353,7 +348,6 @@ READERS = (
     Reader("options", ".json", noted(OPTIONS),
            file("segmented/options.json", lambda p: recorded_settings(RunDir(p.parents[1]))), 3000),
     Reader("manifest", ".json", _manifest, file("manifest.json", _read_manifest)),
-    Reader("begun", ".npz", checkpoints, file("checkpoint.npz", _read_begun)),
     Reader("segmented", ".json", documents(lambda n: {str(i): f"thing {i}" for i in range(n)}),
            file(".taxonomy.json", lambda p: segmenters._begin(p.parent, Taxonomy({0: "thing 0"}), [])), 1000),
     Reader("photo-hashes", ".json", _hashes, file("photos.json", _read_hashes), 1000),

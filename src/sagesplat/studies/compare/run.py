@@ -252,7 +252,7 @@ def _keep(job: Job, part: tuple[Callable[[Job, Any], Gaussians], Any, str, int])
 
 
 def snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
-    """Settled snapshots, spread in size; of equal ones the latest."""
+    """Snapshots that no reset has just disturbed, spread in size; of equal ones the latest."""
     ladder = snapshots.recorded
     sizes = [ladder.size(level) for level in ladder.levels]
     wanted = np.geomspace(max(1, min(sizes)), max(sizes), config.snapshots)[::-1]

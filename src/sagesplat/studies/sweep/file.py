@@ -1,5 +1,6 @@
 """The file of a sweep: scenes, variants of the settings, seeds and targets."""
 
+import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
@@ -17,7 +18,7 @@ MAX_LENGTH = 2**20  # characters of a file
 MAX_RUNS = 10_000
 BUILT_IN = "demo"  # as a scene's path: the built-in capture
 _SET_BY = dict.fromkeys(("target_ssim", "target_fidelity", "other_targets"), "targets") | {"seed": "seeds"}
-_Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.+-]{0,99}\Z")]  # also of a folder
+_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,99}"  # also of a folder
 
 
 @dataclass(frozen=True)
@@ -44,9 +45,9 @@ class _File:
 
     targets: Annotated[tuple[SomeShare, ...], Meta(min_length=1)]
     seeds: Annotated[tuple[Seed, ...], Meta(min_length=1)]
-    scenes: Annotated[dict[_Name, str], Meta(min_length=1)]
+    scenes: Annotated[dict[str, str], Meta(min_length=1)]
     settings: dict[str, Any] = field(default_factory=dict)
-    variants: dict[_Name, dict[str, Any]] = field(default_factory=dict)
+    variants: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 def read_sweep(path: Path) -> Sweep:
@@ -55,9 +56,13 @@ def read_sweep(path: Path) -> Sweep:
     document = read_toml(path, cure, most=MAX_LENGTH)
     with refused(path, what, cure):
         file = convert_as(_known(document, _File, "", folder), _File)
+        _config(file.settings, "settings.")
     targets = sorted(round(target, 6) for target in file.targets)
     for key, values in (("targets", targets), ("seeds", file.seeds)):
         _need(len(set(values)) == len(values), f"{path}: {key}: two are equal; leave one out")
+    for name in (*file.scenes, *file.variants):
+        fine = re.fullmatch(_NAME, name)
+        _need(fine, f"{path}: the name {short(repr(name))} makes no folder; use letters, digits, _ . + and -")
     count = len(file.scenes) * max(1, len(file.variants)) * len(file.seeds)
     _need(count <= MAX_RUNS, f"{path}: {count} runs, at most {MAX_RUNS} are possible; split the sweep")
     main = targets.pop(len(targets) // 2)
@@ -70,8 +75,8 @@ def read_sweep(path: Path) -> Sweep:
         )
         for variant, changes in (file.variants or {"": {}}).items():
             with refused(path, what, cure):
-                changes = _known(changes, RunConfig, f"variants.{variant}.", folder)
-                config = convert_as(_merged(file.settings, changes), RunConfig)
+                where = f"variants.{variant}."
+                config = _config(_merged(file.settings, _known(changes, RunConfig, where, folder)), where)
             plan = replace(config.plan, target_ssim=main, other_targets=tuple(targets))
             cells += [Cell(scene, variant, capture, replace(config, plan=plan, seed=s)) for s in file.seeds]
     names = [cell.name.lower() for cell in cells]  # some disks know no capitals
@@ -110,6 +115,13 @@ def _known(table: Any, kind: Any, where: str, folder: Path) -> Any:
         else:
             made[name] = value
     return made
+
+
+def _config(settings: Mapping[str, Any], where: str) -> RunConfig:
+    try:
+        return convert_as(settings, RunConfig)
+    except ValueError as error:
+        raise ValueError(f"{where}{error}") from None
 
 
 def _merged(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -140,10 +140,11 @@ def _share_training(runs: Path, like: Cell | None, cell: Cell) -> None:
     old = RunDir(runs / like.name)
     if old.capture.exists() or old.blocks.exists():  # these are named in there
         return
-    stages = [old.provenance(stage) for stage in ("scene", "segment", "masks", "lift", "train", "clean")]
-    made = [old.scene, old.geometry, old.segmented, old.masks, old.labels]
-    made += [old.levels, old.checkpoint, old.cap, old.frozen, old.cameras, old.refined, old.inliers]
-    made += [old.sky, old.cleaned, old.floaters, old.floaters_picture, *stages]
+    stages = ("scene", "given", "segment", "photo_instances", "masks", "lift", "train", "clean")
+    made = [old.scene, old.geometry, old.given, old.segmented, old.photo_instances, old.masks, old.valid]
+    made += [old.labels, old.levels, old.checkpoint, old.cap, old.frozen, old.cameras, old.refined, old.sky]
+    made += [old.inliers, old.cleaned, old.floaters, old.floaters_picture]
+    made += map(old.provenance, stages)
     with atomic_folder(new.path) as fresh:
         # links take no room; nothing in a run is changed in place
         for path in (p for p in made if p.exists()):
