@@ -112,7 +112,7 @@ class Site:
         path = PurePath(viewer.get_path(request.scope))
         name = PAGE if path == PurePath(".") else path.as_posix()
         if name == PAGE and (folder / POSTER).is_file():
-            return HTMLResponse(with_poster((self._viewer / PAGE).read_text()))
+            return HTMLResponse(with_poster((self._viewer / PAGE).read_text(encoding="utf-8")))
         for files in (viewer, data) if _is_data(path) else (viewer,):
             try:
                 response = await files.get_response(name, request.scope)
