@@ -90,6 +90,7 @@ class Site:
         self._hosts, self._viewer = hosts or Hosts(), viewer or package_viewer()
         gzip = Middleware(GZipMiddleware, compresslevel=4, exclude_content_types=_NOT_GZIPPED)
         self._app = Starlette(routes=[*routes, Route("/{path:path}", self._answer)], middleware=[gzip])
+        self._app.router.redirect_slashes = False  # a path without any is no file
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
