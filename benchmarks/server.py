@@ -60,16 +60,8 @@ def measure(idle: int, slow: int, honest: int, tls: bool, files: int = FILES) ->
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         hashes = make_bundle(folder / "bundle")
-        command = [
-            sys.executable,
-            "-m",
-            "sagesplat",
-            "view",
-            folder / "bundle",
-            "--port",
-            "0",
-            "--no-browser",
-        ]
+        command = [sys.executable, "-m", "sagesplat", "view", folder / "bundle"]
+        command += ["--port", "0", "--no-browser"]
         context = None
         if tls:
             certificate, key = make_certificate(folder)

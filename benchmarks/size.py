@@ -38,7 +38,6 @@ from sagesplat.raster import device_of, resolve_backend, set_threads
 from sagesplat.run.job import Job
 from sagesplat.run.records import seconds_of, settings_of
 from sagesplat.run.run_dir import RunDir
-from sagesplat.run.stage_table import STAGES, StageKind
 from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.clean import clean_levels
@@ -71,7 +70,6 @@ from sagesplat.train.stepper import Stepper
 
 Say = Callable[[str], None]
 SCENES = {"garden": "garden", "dinosaur": "dinosaur", "built-in": "built-in-11"}  # name: of `promises.CASES`
-STAGES["as_one"] = StageKind(("nest", "train"))  # of this benchmark alone
 _TOGETHER = 8  # sets in memory at a time
 _TIMED = 100  # steps of nesting, and on the full model, whose CPU time decides how many take as long
 
@@ -211,12 +209,12 @@ def _as_trained(job: Job, path: Path) -> Gaussians:
 def _as_one(job: Job, place: Path, asked: Asked) -> Baseline:
     nest = settings_of(job.run, "nest")
     config = NestConfig(steps=nest["steps"])
-    there = sorted(place.glob("as_one-*.npz"))
+    there = sorted(place.glob("pruned-none-*.npz"))
     before = int(there[0].stem.rpartition("-")[2]) if there else 0
     config = replace(config, steps=asked.as_one_steps or before or _steps_as_long(job, config))
     run = job.run
     return Baseline(
-        AS_ONE, f"{config.steps} steps more", place / f"as_one-{config.steps}.npz",
+        AS_ONE, f"{config.steps} steps more", place / f"pruned-none-{config.steps}.npz",
         job.last_level.step + config.steps, {**asdict(config), "seed": asked.seed},
         [*run.scene_files, job.trained, *inlier_inputs(run), *existing(run.sky)], train_as_one,
         lambda: (config, asked.seed),

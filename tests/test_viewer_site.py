@@ -144,7 +144,7 @@ ESCAPES = [
     "//secret.txt", "/%2fetc/passwd", "/file:///etc/passwd", "/C:/Windows/win.ini", "/index.html%00.json",
     "/index.html%0a", "/index.html::$DATA", "/.hidden", "/.hidden.json", "/chunks/.a/b.json", "/chunks",
     "/chunks/", "/chunks/leads-out.spz", "/out/secret.txt", "/out/bundle-other/secret.txt", "/circle.spz",
-    "/%ff%fe", "http://127.0.0.1/../secret.txt", "/" + "a" * 5000, "/" + "a/" * 3000,
+    "/%ff%fe", "?/../secret.txt", "http://127.0.0.1/../secret.txt", "/" + "a" * 5000, "/" + "a/" * 3000,
 ]  # fmt: skip
 
 

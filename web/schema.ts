@@ -27,7 +27,10 @@ export async function typesOfSchema(): Promise<string> {
     .replace(/\/\*\*\n *\* ([^\n]*)(\n *\*)*\n *\*\//g, "/** $1 */");
 }
 
-/** Brings the types up to date when the viewer is built, and leaves descriptions out of the schema that it holds. */
+/**
+ * Brings the types up to date when the viewer is built, and leaves descriptions out of the schema that it holds,
+ * but for those of patterns, which messages say.
+ */
 export function schema(): Plugin {
   return {
     name: "schema",
@@ -37,10 +40,13 @@ export function schema(): Plugin {
     },
     load(id) {
       if (!id.endsWith(".schema.json")) return null;
-      const isProse = (key: string, value: unknown) => key === "description" && typeof value === "string";
-      return JSON.stringify(
-        JSON.parse(readFileSync(id, "utf8"), (key, value) => (isProse(key, value) ? undefined : value)),
-      );
+      const withoutProse = (_key: string, value: unknown) => {
+        if (typeof value !== "object" || value === null || Array.isArray(value) || "pattern" in value)
+          return value;
+        const { description, ...others } = value as Record<string, unknown>;
+        return typeof description === "string" ? others : value;
+      };
+      return JSON.stringify(JSON.parse(readFileSync(id, "utf8"), withoutProse));
     },
   };
 }

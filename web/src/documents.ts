@@ -2,9 +2,11 @@
 
 export type Vec3 = [number, number, number];
 export type Whole = number;
+/** A SHA-256 in hexadecimal. */
 export type Sha256 = string;
 /** Smallest x y z, largest x y z. */
 export type Box = [number, number, number, number, number, number];
+/** A path below the bundle's folder. */
 export type Path = string;
 /** A range of a coded stream, which is one file for all levels of a label; or SPZ version 3; or a binary PLY in INRIA's layout, its y and z opposite to the bundle's. */
 export type Format = "stream" | "spz" | "ply";
@@ -85,6 +87,7 @@ export interface Label {
   parent?: string;
   /** Display name. */
   title: string;
+  /** A colour as #rrggbb. */
   color: string;
   weight: number;
   /** Always shipped in full, independent of the plan. */

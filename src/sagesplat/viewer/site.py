@@ -90,6 +90,7 @@ class Site:
         self._hosts, self._viewer = hosts or Hosts(), viewer or package_viewer()
         gzip = Middleware(GZipMiddleware, compresslevel=4, exclude_content_types=_NOT_GZIPPED)
         self._app = Starlette(routes=[*routes, Route("/{path:path}", self._answer)], middleware=[gzip])
+        self._app.router.redirect_slashes = False  # a path without any is no file
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -112,7 +113,7 @@ class Site:
         path = PurePath(viewer.get_path(request.scope))
         name = PAGE if path == PurePath(".") else path.as_posix()
         if name == PAGE and (folder / POSTER).is_file():
-            return HTMLResponse(with_poster((self._viewer / PAGE).read_text()))
+            return HTMLResponse(with_poster((self._viewer / PAGE).read_text(encoding="utf-8")))
         for files in (viewer, data) if _is_data(path) else (viewer,):
             try:
                 response = await files.get_response(name, request.scope)

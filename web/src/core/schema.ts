@@ -18,6 +18,7 @@ export interface Schema {
   readonly exclusiveMinimum?: number;
   readonly exclusiveMaximum?: number;
   readonly pattern?: string;
+  readonly description?: string; // of a pattern, in words
   readonly items?: Schema;
   readonly minItems?: number;
   readonly maxItems?: number;
@@ -111,6 +112,8 @@ function fits(value: unknown, schema: Schema): boolean {
 /** What a value must be, in words. */
 function expected(schema: Schema): string {
   const { type = "null", minimum, maximum, exclusiveMinimum, exclusiveMaximum, minItems, maxItems } = schema;
+  const { pattern, description = "" } = schema;
+  if (pattern) return description.replace(/^A/, "a").replace(/\.$/, "");
   const allowed = "const" in schema ? [schema.const] : schema.enum;
   if (allowed) return allowed.map((one) => JSON.stringify(one)).join(" or ");
   const parts: (string | false)[] = [
@@ -122,7 +125,6 @@ function expected(schema: Schema): string {
     exclusiveMaximum !== undefined && `below ${exclusiveMaximum}`,
     minItems !== undefined && minItems !== maxItems && `of at least ${minItems}`,
     maxItems !== undefined && `of ${minItems === maxItems ? "" : "at most "}${maxItems}`,
-    schema.pattern !== undefined && `that matches ${schema.pattern}`,
   ];
   return parts.filter((part) => part).join(" ");
 }

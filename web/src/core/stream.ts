@@ -80,7 +80,7 @@ export class StreamDecoder<Level> {
     const columns = this.columns as Columns;
     const block = blockOf(this.header as Header);
     const reader = new Reader(payload);
-    if (weight) this.decodeOwed(reader, level);
+    if (weight) this.decodeDeferred(reader, level);
     const deferred = new Uint8Array(weight ? 0 : this.deferred.length + total);
     deferred.set(this.deferred);
     let before = 0;
@@ -98,7 +98,7 @@ export class StreamDecoder<Level> {
     reader.finish();
   }
 
-  private decodeOwed(reader: Reader, level: Level): void {
+  private decodeDeferred(reader: Reader, level: Level): void {
     const columns = this.columns as Columns;
     const block = blockOf(this.header as Header);
     for (let at = 0; at < this.deferred.length; ) {

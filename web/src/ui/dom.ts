@@ -58,10 +58,6 @@ export const textButton = (
   props: Props = {},
 ): HTMLButtonElement => h("button", { type: "button", class: className, click, ...props }, text);
 
-/** Whether an event goes to something that takes keys itself. */
-export const isTyping = ({ target }: Event): boolean =>
-  target instanceof HTMLElement && target.closest("input, select, textarea, dialog[open]") !== null;
-
 /** A button with an icon; its title is the tooltip and the accessible name. */
 export function iconButton(
   name: IconName,

@@ -1,6 +1,7 @@
 import type { Category, Operation } from "../core/edits";
+import { isTyping } from "../view/controls";
 import { type Editor, SCOPES, type Scope } from "../view/editor";
-import { h, iconButton, isTyping, setText, textButton } from "./dom";
+import { h, iconButton, setText, textButton } from "./dom";
 import { formatCount } from "./format";
 import { messageOf } from "./notice";
 import { save, saved } from "./saving";

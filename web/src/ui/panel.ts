@@ -1,7 +1,8 @@
 import { qualitiesOf } from "../core/manifest";
 import type { Quality, Settings } from "../types";
+import { isTyping } from "../view/controls";
 import { DEFAULT_TARGETS, type Viewer } from "../view/viewer";
-import { h, iconButton, isTyping, setText } from "./dom";
+import { h, iconButton, setText } from "./dom";
 import { formatBytes, formatCount, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
 

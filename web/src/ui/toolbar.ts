@@ -1,6 +1,7 @@
+import { isTyping } from "../view/controls";
 import type { Viewer } from "../view/viewer";
 import { offered, type XrMode } from "../view/xr";
-import { h, iconButton, isTyping, setIcon, textButton } from "./dom";
+import { h, iconButton, setIcon, textButton } from "./dom";
 import type { EditorCard } from "./editor";
 import { blockColor } from "./groups";
 import { messageOf } from "./notice";

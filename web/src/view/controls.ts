@@ -25,6 +25,10 @@ const TURN_KEYS: Readonly<Record<string, readonly [number, number]>> = {
   ArrowDown: [0, -1],
 };
 
+/** Whether an event goes to something that takes keys itself; a dialog that is closed does not. */
+export const isTyping = ({ target }: Event): boolean =>
+  target instanceof HTMLElement && target.closest("input, select, textarea, dialog[open]") !== null;
+
 /** Orbit and walk by mouse, touch, keyboard and gamepad. */
 export class Controls {
   mode: Mode = "orbit";
@@ -141,9 +145,7 @@ export class Controls {
 
   #key(event: KeyboardEvent): void {
     if (event.ctrlKey || event.altKey || event.metaKey) return;
-    const target = event.target;
-    const widget = target instanceof HTMLElement && target.closest("input, select, textarea, dialog");
-    if (widget || !(event.code in MOVE_KEYS || event.code in TURN_KEYS)) return;
+    if (isTyping(event) || !(event.code in MOVE_KEYS || event.code in TURN_KEYS)) return;
     event.preventDefault();
     this.#keys.add(event.code);
     if (event.shiftKey) this.#keys.add("ShiftLeft");

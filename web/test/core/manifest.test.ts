@@ -104,7 +104,7 @@ test.each([
   "",
 ])("%j is no path below the bundle", (uri) => {
   for (const path of ["labels.1.levels.0.uri", "promises.fidelity.uri"]) {
-    expect(refusal(plain, path, uri)).toContain("uri must be a text that matches");
+    expect(refusal(plain, path, uri)).toContain("uri must be a path below the bundle's folder");
   }
 });
 
@@ -119,8 +119,8 @@ test.each<[string, unknown, string, Manifest?]>([
   ["labels.0.boxes", [[1, 0, 0, 0, 0, 0]], "labels[0].boxes"],
   ["labels.0.boxes", [[1, 0]], "labels[0].boxes[0] must be a list of 6"],
   ["labels.0.weight", -1, "labels[0].weight must be a number from 0 on"],
-  ["labels.0.color", "red", "labels[0].color"],
-  [`${LEVELS}.0.sha256`, "12", "labels[0].levels[0].sha256"],
+  ["labels.0.color", "red", "labels[0].color must be a colour as #rrggbb"],
+  [`${LEVELS}.0.sha256`, "12", "labels[0].levels[0].sha256 must be a SHA-256 in hexadecimal"],
   [`${LEVELS}.0.bytes`, 1.5, "labels[0].levels[0].bytes must be a whole number from 1 on"],
   [`${LEVELS}.0.format`, "ksplat", 'must be "stream" or "spz" or "ply"'],
   [`${LEVELS}.0.refine`, "REPLACE", "labels[0].levels[0] has nothing to replace"],
