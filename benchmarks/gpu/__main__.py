@@ -44,13 +44,17 @@ def main(
     minutes: float = 9.0,
     device: Literal["cuda", "cpu"] = "cuda",
     only: tuple[str, ...] = (),
+    runs: tuple[str, ...] = (),
     masks: Path | None = None,
     lpips: Path | None = None,
     out: Path | None = None,
     write: bool = False,
 ) -> None:
-    """All checks that a machine with a GPU owes, in so many minutes; `--device cpu` tries the script."""
-    asked = Asked(scene, downscale, steps, minutes, device, only, masks, lpips, out, write)
+    """All checks that a machine with a GPU owes, in so many minutes; `--device cpu` tries the script.
+
+    `runs`: the trainings of `race` and `freeze`, of ours, gsplat, third, two_thirds, all; none: all of them.
+    """
+    asked = Asked(scene, downscale, steps, minutes, device, only, runs, masks, lpips, out, write)
     raise SystemExit(check(asked))
 
 

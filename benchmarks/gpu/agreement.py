@@ -28,7 +28,7 @@ from sagesplat.train.state import TrainState, from_points, initial_state
 from sagesplat.train.stepper import Stepper
 from sagesplat.train.strategy import make_strategy
 
-TESTS = ("test_raster_cuda", "test_raster_cpu", "test_ssim_triton", "test_train_adam_triton")
+TESTS = ("test_raster_cuda", "test_raster_cpu", "test_metrics_ssim_triton", "test_train_adam_triton")
 TOLERANCES = {"cuda": (1e-4, 1e-3), "cpu": (3e-6, 1e-5)}  # of images, of gradients: those of the tests
 
 

@@ -29,6 +29,7 @@ class Asked:
     minutes: float = 9.0
     device: Literal["cuda", "cpu"] = "cuda"
     only: tuple[str, ...] = ()
+    runs: tuple[str, ...] = ()
     masks: Path | None = None
     lpips: Path | None = None
     out: Path | None = None
@@ -42,6 +43,7 @@ class Asked:
         for name in ("masks", "lpips", "out"):
             if (path := getattr(self, name)) is not None:
                 words += [f"--{name}", str(path)]
+        words += ["--runs", *self.runs] * bool(self.runs)
         return words + ["--only", *self.only] * bool(self.only)
 
 

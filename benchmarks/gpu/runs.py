@@ -93,7 +93,7 @@ def race(bench: Bench) -> Outcome:
     hopeless = {"gsplat": "it needs a GPU"} if bench.small else {}
     if bench.masks is None:
         hopeless |= dict.fromkeys(("third", "two_thirds", "all"), "no label images")
-    for name in ("gsplat", "ours", "third", "two_thirds", "all"):
+    for name in bench.asked.runs or ("gsplat", "ours", "third", "two_thirds", "all"):
         if name in hopeless:
             missed[name] = hopeless[name]
             continue
@@ -126,7 +126,7 @@ def freeze(bench: Bench) -> Outcome:
     whole = run_of(bench, "ours")
     figures: dict[str, Any] = {"without": {"seconds": whole.seconds, "steps": whole.steps}}
     figures["label_ssim_at_a_third"], parts, failed = whole.label_ssim, [], False
-    for name in ("third", "two_thirds", "all"):
+    for name in _frozen(bench):
         try:
             run = run_of(bench, name)
         except Exception as error:
@@ -141,6 +141,11 @@ def freeze(bench: Bench) -> Outcome:
             f"({whole.curve[-1]['step_ms']:.2f} without), {run.seconds:.1f} of {whole.seconds:.1f} s"
         )
     return Outcome("FAILED" if failed else "ok", "; ".join(parts), figures)
+
+
+def _frozen(bench: Bench) -> list[str]:
+    """The trainings that freeze which are asked for."""
+    return [name for name in ("third", "two_thirds", "all") if name in (bench.asked.runs or WEIGHTS)]
 
 
 def multi(bench: Bench) -> Outcome:
@@ -200,7 +205,9 @@ def _train(bench: Bench, name: str) -> Run:
 def steps_of(bench: Bench) -> int:
     """Steps of each long run: as asked, or as many as there is time for when first asked."""
     if bench.steps == 0:
-        names = list(WEIGHTS) if bench.chosen("race") or bench.chosen("freeze") else ["ours"]
+        names = ["ours"]
+        if bench.chosen("race") or bench.chosen("freeze"):
+            names = [name for name in WEIGHTS if name in (bench.asked.runs or WEIGHTS)]
         if bench.masks is None:
             names = [name for name in names if name in ("ours", "gsplat")]
         if not bench.chosen("race") or bench.small:

@@ -55,6 +55,7 @@ EXCEPTIONS: dict[str, str] = {
     "run.stage:run_stages": _WROTE,
     "stages.adopt:_label": "by read_header and read_level, which the readers run",
     "stages.adopt:_make_capture": _WROTE,
+    "stages.live_bundle:_live_bundle": OURS,
     "stages.regroup:_headers": "by read_header of coded streams, which the readers run",
     "stages.regroup:_write_ladder": "by read_header of levels, which the readers run",
     "stages.nest:nest_levels.make": "by read_header and read_level, which the readers run",
