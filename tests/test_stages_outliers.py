@@ -35,7 +35,8 @@ def job(finished_run: Path, tmp_path: Path) -> Job:
     photos = [render_rgb(g, view.camera, backend="cpu", antialiased=False) * 255 for view in scene.views]
     for photo in photos[:2]:
         photo[FIGURE] = np.where(photo[FIGURE].mean((0, 1)) < 128, 255, 0)
-    job.photos = [photo.round().astype(np.uint8) for photo in photos]
+    for row, photo in enumerate(photos):
+        job.photos[row][:] = photo.round()
     return job
 
 

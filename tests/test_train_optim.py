@@ -42,10 +42,11 @@ def test_steps_are_torchs(shape):
 def test_frozen_rows_and_columns_keep_every_bit_and_the_others_do_not_notice(columns):
     n = 5000
     moving = np.zeros((n, 45), bool)
-    moving[np.random.default_rng(2).random(n) < 0.5, :columns] = True
+    some = np.random.default_rng(2).random(n) < 0.5
+    moving[some, :columns] = True
     start = [np.random.default_rng(4).random((n, 15, 3)).astype(np.float32) for _ in range(3)]
     part, free = [a.copy() for a in start], [a.copy() for a in start]
-    rows = moving.any(1) if columns != 0 else np.ones(n, bool)
+    rows = some if columns != 0 else np.ones(n, bool)
     for step, grad in enumerate(gradients((n, 15, 3), 3), start=10):
         adam_step(free[0], grad, *free[1:], lr=0.01, step=step, trainable=np.ones(n, bool))
         grad.reshape(n, 45)[~moving] = np.nan

@@ -156,7 +156,8 @@ def _reload_variables() -> None:
     from ray._private import ray_constants
     from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore
 
-    ray_constants.ENABLE_RAY_CLUSTER = ray_constants.env_bool(_LOOPBACK, not ray_constants.IS_WINDOWS_OR_OSX)
+    given, elsewhere = os.environ.get(_LOOPBACK), not ray_constants.IS_WINDOWS_OR_OSX
+    ray_constants.ENABLE_RAY_CLUSTER = elsewhere if given is None else given.lower() in ("true", "1")
     Config.initialize("")
     AuthenticationTokenLoader.instance().reset_cache()
 

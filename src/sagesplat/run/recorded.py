@@ -30,7 +30,7 @@ Config = TypeVar("Config")
 def recorded_ladder(path: Path) -> LadderKind:
     """The kind of levels that a run has results of: nested ones, unless there are only others."""
     kinds: tuple[LadderKind, ...] = get_args(LadderKind)
-    made = [kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()]
+    made: list[LadderKind] = [kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()]
     return made[0] if len(made) == 1 else "nested"
 
 

@@ -363,7 +363,7 @@ def _settings(config: MasksConfig) -> dict[str, Any]:
 
 def _load(config: MasksConfig, device: str, threads: int, warn: Callable[[str], None]) -> DeepLabV2Segmenter:
     network = load_deeplabv2(Path(config.model or ""))
-    head = next(head for head, outputs in HEADS.items() if outputs == network.num_classes)
+    head: Head = next(head for head, outputs in HEADS.items() if outputs == network.num_classes)
     return DeepLabV2Segmenter(network, head_classes(head), crf=config.crf, device=device)
 
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from tests.fuzz.hostile import MIB, Reader
 from tests.fuzz.readers.making import PHOTOS, as_json, documents, file, put, put_photos, written, written_by
 
 TAXONOMY = Taxonomy({1: "sky", 2: "tree"})
-FRAMES = {"size": 9, "mtime_ns": 9, "max_frames": 9}
+FRAMES = video._Extracted(size=9, mtime_ns=9, max_frames=9, frames=[])
 CAMERA = Camera(np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32), 16, 12)
 
 
@@ -225,7 +226,8 @@ READERS = (
     Reader("panoptic", ".json", documents(_panoptic),
            file("p.json", lambda path: read_panoptic(path.parent)), 1000),
     Reader("video", ".mp4", _videos, file("v.mp4", _read_video), 60, 16 * MIB),
-    Reader("video-frames", ".json", documents(lambda n: FRAMES | {"frames": ["frame_000001.jpg"] * n}),
+    Reader("video-frames", ".json",
+           documents(lambda n: asdict(FRAMES) | {"frames": ["frame_000001.jpg"] * n}),
            file("video.json", _read_frames), 1000),
     Reader("poses-request", ".json",
            documents(lambda n: REQUEST | {"photos": ["a.jpg"] * n, "min_photos": 3, "threads": -1}),
