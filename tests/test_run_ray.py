@@ -302,7 +302,8 @@ def test_the_command_line_on_a_cluster(cluster: Any, trained: Path, tmp_path: Pa
 @pytest.mark.slow
 def test_a_cluster_of_this_machine_is_started_and_ended(tmp_path: Path) -> None:
     make_capture(tmp_path / "capture", views=8, width=64, height=48)
-    made = command("run", tmp_path / "capture", tmp_path / "run", *SHORT, "--executor", "ray", RAY_ADDRESS="")
+    words = ("run", tmp_path / "capture", tmp_path / "run", *SHORT, "--executor", "ray")
+    made = command(*words, RAY_ADDRESS="local")  # else it would join the cluster of the tests above
     assert (made.returncode, made.stderr) == (0, "")
     assert (tmp_path / "run" / "snapshots" / "report" / "index.html").exists()
 
