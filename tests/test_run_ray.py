@@ -308,6 +308,32 @@ def test_a_cluster_of_this_machine_is_started_and_ended(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "snapshots" / "report" / "index.html").exists()
 
 
+ALONE = """
+import sys
+import ray
+from sagesplat.run.ray_cluster import connected
+with connected():
+    print(ray.get_runtime_context().gcs_address, flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.mark.slow
+def test_runs_side_by_side_have_a_cluster_each(tmp_path: Path) -> None:
+    """Where none was started with `ray start`: RAY_TMPDIR has the address of one that was."""
+    environment = {**os.environ, "RAY_ADDRESS": "", "RAY_TMPDIR": str(tmp_path)}
+    words = [sys.executable, "-c", ALONE]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, env=environment) as first:
+        assert first.stdout is not None
+        address = first.stdout.readline()
+        second = subprocess.run(
+            words, input="", capture_output=True, text=True, timeout=120, env=environment, check=False
+        )
+    assert (second.returncode, second.stderr, first.returncode) == (0, "", 0)
+    assert "" != address != second.stdout != ""
+
+
 OWN = """
 import os, sys
 import ray

@@ -48,7 +48,7 @@ _ABOUT_TOKENS = "authentication_token_setup"
 def connected(address: str = "") -> Iterator[Mapping[str, float]]:
     """A connection to a cluster; what it has in all comes back: "CPU", "GPU", "memory" (bytes), ...
 
-    `address` is host:port; without one RAY_ADDRESS or the cluster that runs on this machine is taken, else
+    `address` is host:port; without one RAY_ADDRESS or the cluster that `ray start` knows here is taken, else
     one of this machine is started, and ended again. RunError where the cluster does not answer. A connection
     that this process has already is used. Ray's warnings are written to stderr, each once.
     """
@@ -80,6 +80,8 @@ def _join(address: str, warn: "_Warnings") -> bool:
     if address == "local":
         return False
     named = address not in ("", "auto")
+    if not named and not (address := _started_here()):
+        return False
     waits = threading.Timer(_GREETED, warn, [_WAITS])
     waits.daemon = True
     if named:
@@ -88,14 +90,24 @@ def _join(address: str, warn: "_Warnings") -> bool:
         waits.start()
     try:
         with signals.answered_at_once():  # Ray waits for minutes, and starts nothing here
-            _init(address=address if named else "auto")
+            _init(address=address)
     except ConnectionError as error:
         if named:
             raise _no_connection(error) from None
-        return False  # this machine is no node of any
+        return False  # it is gone
     finally:
         waits.cancel()
     return True
+
+
+def _started_here() -> str:
+    """The cluster that `ray start` made this machine a node of, "" without one.
+
+    Ray's own "auto" takes any that it finds among the processes, such as another run's, which is not for us.
+    """
+    from ray._private.services import find_bootstrap_address
+
+    return find_bootstrap_address(None) or ""
 
 
 def _init(**options: Any) -> None:
