@@ -53,7 +53,9 @@ CASES = {
 }
 
 
-def measure(folder: Path, names: tuple[str, ...], views: int, redraws: int, say: Say) -> dict[str, Any]:
+def measure(
+    folder: Path, names: tuple[str, ...], views: int, by_condition: int, redraws: int, say: Say
+) -> dict[str, Any]:
     """Run each scene (what is done already is skipped), and measure both qualities."""
     results = {}
     for name in names:
@@ -67,10 +69,13 @@ def measure(folder: Path, names: tuple[str, ...], views: int, redraws: int, say:
         fidelity = promises_fidelity.measure(job, views)
         for line in promises_fidelity.lines(name, fidelity):
             say(line)
+        conditions = promises_fidelity.by_condition(job, by_condition)
+        for line in promises_fidelity.condition_lines(conditions, fidelity["categories"]):
+            say(line)
         photos = promises_photos.measure(job, redraws)
         for line in promises_photos.lines(name, photos):
             say(line)
-        results[name] = {"fidelity": fidelity, "photos": photos}
+        results[name] = {"fidelity": fidelity, "conditions": conditions, "photos": photos}
     return results
 
 
@@ -78,6 +83,7 @@ def main(
     folder: Path = Path("runs/promises"),
     scenes: tuple[str, ...] = tuple(CASES),
     views: int = 300,
+    by_condition: int = 200,
     redraws: int = 20,
     write: bool = False,
 ) -> None:
@@ -86,11 +92,12 @@ def main(
     Args:
         folder: where the scenes are run; what is done there already is not run again.
         scenes: which of them.
-        views: fresh viewpoints a scene.
+        views: fresh viewpoints a scene, drawn by the run's rule.
+        by_condition: fresh viewpoints for each of: path at half, one and twice the pixels, walk, back.
         redraws: of calibration and test photos.
         write: keep the figures in benchmarks/results/cpu/promises.json.
     """
-    finish("promises", measure(folder, scenes, views, redraws, print), write)
+    finish("promises", measure(folder, scenes, views, by_condition, redraws, print), write)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Coverage of fidelity bounds at fresh viewpoints, and plans beside equal levels of the same bytes."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,13 +9,19 @@ import numpy as np
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, quality_at
 from sagesplat.adapt.fidelity import distances_at, measure_compositions, shown_enough
 from sagesplat.adapt.fidelity_models import plan_nominal
-from sagesplat.adapt.viewpoints import Rule, capture_cameras, draw
+from sagesplat.adapt.viewpoint import where
+from sagesplat.adapt.viewpoints import capture_cameras, draw
 from sagesplat.run.job import Job
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import fidelity_of, plans_of, viewpoints_of
 
 TARGETS = (0.8, 0.9, 0.95, 0.98)
 MORE_TARGETS = (0.5, 0.6, 0.7, 0.75, 0.85, 0.97, 0.99)  # of the curve of plans over bytes
+# places (path, walk, back) and screens of the viewpoints
+CONDITIONS: dict[str, tuple[tuple[float, float, float], float]] = {
+    "path": ((1, 0, 0), 1.0), "path, half the pixels": ((1, 0, 0), 0.5),
+    "path, twice the pixels": ((1, 0, 0), 2.0), "walk": ((0, 1, 0), 1.0), "back": ((0, 0, 1), 1.0),
+}  # fmt: skip
 _DRAWS = 1000  # bootstrap
 
 
@@ -27,7 +34,7 @@ def measure(
     on the cheapest levels that they allow; `curve` is of plans as they are made (`plan_for_view`).
     """
     models, rule = fidelity_of(job), viewpoints_of(job).rule
-    fresh = Rule(rule.seed + seed, rule.neighbours, rule.shift, rule.turn)
+    fresh = replace(rule, seed=rule.seed + seed)
     cameras = draw(job.scene, capture_cameras(job.scene), fresh, {"test": views}).cameras
     costs = NestedLevels(job).costs
     labels, K, names = list(costs.labels), len(job.ladder.levels), job.names()
@@ -85,6 +92,39 @@ def measure(
     }  # fmt: skip
 
 
+def by_condition(job: Job, views: int = 200, seed: int = 91_000) -> dict[str, Any]:
+    """The targets by condition: kept, excess, share that has a promise, MB of plans and of all."""
+    models, rule = fidelity_of(job), viewpoints_of(job).rule
+    costs, names = NestedLevels(job).costs, job.names()
+    labels, K = list(costs.labels), len(job.ladder.levels)
+    targets, found = np.array(TARGETS), {}
+    for name, (places, screen) in CONDITIONS.items():
+        drawn = replace(rule, seed=rule.seed + seed, places=places, screens=(screen, screen))
+        cameras = draw(job.scene, capture_cameras(job.scene), drawn, {"test": views}).cameras
+        distance = distances_at(job.scene, job.point_labels, cameras, labels, job.fit_config.distance)
+        far = dict(zip(labels, distance.T.astype(np.float64), strict=True))
+        planned = plan_nominal(models, labels, K, distance, cameras, targets)
+        equal = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (views, K, len(labels)))
+        got, pixels = measure_compositions(
+            job.ladder, cameras, np.concatenate([planned, equal], 1), backend=job.backend,
+            antialiased=job.antialiased,
+        )  # fmt: skip
+        quality = quality_at(costs, models, far, cameras, "fidelity")
+        shown = shown_enough(pixels, cameras) & [label in models for label in labels]
+        promised = _promised(models, labels, distance, cameras)
+        rows = {}
+        for j, target in enumerate(TARGETS):
+            row = _coverage(
+                target, planned[:, j] - 1, got[:, j, :-1], got[:, len(targets) :, :-1], shown & promised,
+                [names[label] for label in labels],
+            )  # fmt: skip
+            levels = np.array([made(quality, costs, target, v, pixels[v], labels) for v in range(views)])
+            sent = costs.transfer_bytes[np.arange(len(labels)), levels - 1].sum(1).mean()
+            rows[f"{target:g}"] = row | {"promised": float(promised[shown].mean()), "mb": float(sent) / 1e6}
+        found[name] = rows
+    return found
+
+
 def made(
     quality: Quality, costs: Costs, target: float, view: int, pixels: np.ndarray, labels: Sequence[int]
 ) -> list[int]:
@@ -95,12 +135,12 @@ def made(
 
 def _promised(models, labels, distance, cameras):  # type: ignore[no-untyped-def]
     """Whether a bound is given, bool [V, L]: inside the support, of a category with a model."""
-    position = np.stack([camera.position for camera in cameras]).astype(np.float64)
-    direction = np.stack([camera.direction for camera in cameras]).astype(np.float64)
     given = np.zeros((len(cameras), len(labels)), bool)
     for column, label in enumerate(labels):
         if label in models:
-            predicted = models[label].predict(distance[:, column].astype(np.float64), position, direction)
+            predicted = models[label].predict(
+                distance[:, column].astype(np.float64), *where(cameras, models[label].focal)
+            )
             given[:, column] = np.isfinite(predicted.bound).any(1)
     return given
 
@@ -156,6 +196,21 @@ def _curve(
         "lowest": lowest[:J].tolist(),
         "equal_levels_lowest": np.interp(size, level_bytes, lowest[J:]).tolist(),
     }
+
+
+def condition_lines(conditions: dict[str, Any], categories: dict[str, str]) -> list[str]:
+    """The results by condition for people."""
+    out = []
+    for name, rows in conditions.items():
+        for target, row in rows.items():
+            low, high = row["interval"]
+            worst = _worst(row, categories)
+            out.append(
+                f"  {name:22} {target:>5}: promised {row['promised']:.3f} of {row['decisions']}, kept "
+                f"{row['kept']:.3f} [{low:.3f}, {high:.3f}], excess {row['excess']:.4f} (perfect "
+                f"{row['perfect']:.4f}), {row['mb']:.3f} MB; worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
+            )
+    return out
 
 
 def lines(name: str, result: dict[str, Any]) -> list[str]:

@@ -4,12 +4,13 @@ A case of tests/data/distances.json has boxes, a camera, its half spaces and und
 (null: nothing in sight), whether the category is visible and which boxes touch; also the half spaces within
 LENS, the photos', and the distance by them. Planes are to be equal to 1e-9, distances to 1e-9 of themselves.
 A case of tests/data/promises.json has a document as in promises-*.json with one label, and viewpoints with
-the distance, what it is corrected to, and the expected mean and bound by level and the support, to 1e-9
-(null: NaN).
+the focal length in pixels (null: that of the photos), the distance, what it is corrected to, and the expected
+mean and bound by level and the support, to 1e-9 (null: NaN).
 """
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,14 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel, constant_curve
+from sagesplat.adapt.viewpoint import (
+    NO_CALIBRATION,
+    PHOTOS_ONLY,
+    Calibration,
+    QualityKind,
+    ViewModel,
+    constant_curve,
+)
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
 from sagesplat.viewer.frames import FLIP
@@ -30,6 +38,8 @@ Case = dict[str, Any]
 AHEAD = (0.0, 0.0, 0.0, 1.0)
 UNIT = [[-1, -1, -6, 1, 1, -4]]
 LENS = (0.35, 0.3)  # half width and half height at distance 1
+FOCAL = 60.0  # of the photos, pixels
+SCREENS = (0.5, 2.0)
 ROOM = [[-3, -1, -3, 3, 1, 3], [-1, 0, -9, 1, 2, -7]]
 
 
@@ -93,15 +103,19 @@ def model(
     )
     position, direction = rng.normal(0, 0.7, (views, 3)), rng.normal(size=(views, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    screens = SCREENS if quality == "fidelity" else PHOTOS_ONLY
+    log_screen = rng.uniform(*np.log(screens), views)
     return ViewModel(
         label_id=7,
         quality=quality,
         curves=_constants(levels) if quality == "fidelity" else _curves(rng, levels),
         extent=4.5,
         median_log_distance=float(rng.uniform(0.3, 1.2)),
-        inputs=np.column_stack([position, direction, rng.normal(0.8, 0.4, views)]),
+        focal=FOCAL,
+        screens=screens,
+        inputs=np.column_stack([position, direction, log_screen, rng.normal(0.8, 0.4, views)]),
         heldout_inputs=(np.arange(views) % 5 == 2) & unseen & (quality == "ssim"),
-        lengths=tuple(rng.uniform(0.2, 1.2, 3).tolist()),  # pyright: ignore[reportArgumentType]
+        lengths=tuple(rng.uniform(0.2, 1.2, 4).tolist()),  # pyright: ignore[reportArgumentType]
         heldout_variance=float(rng.uniform(0, 0.4)) * unseen,
         weights=rng.normal(0, 0.05, (views, len(levels))) * last,
         rmse=0.03,
@@ -110,12 +124,14 @@ def model(
 
 
 def calibration(quality: QualityKind) -> Calibration:
-    """Thresholds that rise unevenly; of fidelity the full model keeps all targets."""
+    """Thresholds and slopes that rise unevenly; of fidelity the full model keeps all targets."""
     targets = np.array([0.3, 0.5, 0.6, 0.8, 0.9, 0.95])
     thresholds = np.array([0.32, 0.55, 0.601, 0.85, 0.92, 0.971])
+    slopes = np.array([0.25, 0.3, 0.3, 0.2, 0.15, 0.1])
     if quality == "fidelity":
         targets, thresholds = np.append(targets, 1.0), np.append(thresholds, 1.0)
-    return Calibration("calibrated", 0.95, 40, targets, thresholds, 0.3, 0.04 if quality == "ssim" else 0.0)
+        slopes = np.append(slopes, 0.0)
+    return Calibration("calibrated", 0.95, 40, targets, thresholds, slopes, 0.3)
 
 
 def _constants(levels: list[int]) -> tuple[SsimModel, ...]:
@@ -141,8 +157,10 @@ def _curves(rng: np.random.Generator, levels: list[int]) -> tuple[SsimModel, ...
 
 def cameras_at(made: ViewModel) -> list[Camera]:
     """Cameras at the model's own views."""
-    cameras, K = [], np.array([[60, 0, 35], [0, 60, 25], [0, 0, 1]], np.float32)
+    cameras = []
     for row in made.inputs:
+        focal = made.focal * math.exp(row[6])
+        K = np.array([[focal, 0, 35], [0, focal, 25], [0, 0, 1]], np.float32)
         z = row[3:6]
         x = np.cross([0.1, 1, 0.2], z)
         x /= np.linalg.norm(x)
@@ -165,12 +183,15 @@ def _promise_case(name: str, made: ViewModel, seed: int) -> Case:
         position[i] = made.inputs[0, :3] * made.extent + 0.05 * i
         direction[i] = made.inputs[0, 3:6]
     position[1] = 1e3  # far from all
-    away = np.array([math.exp(made.inputs[0, 6]), 2.0, math.nan, 2.1, 1.9999, 3.3, 50.0, 5.0])
-    told = sent.predict(away, position, direction)
+    away = np.array([math.exp(made.inputs[0, 7]), 2.0, math.nan, 2.1, 1.9999, 3.3, 50.0, 5.0])
+    # on the view's own screen, on that of the photos, and on some beyond both ends of what is known
+    screen = np.array([math.exp(made.inputs[0, 6]), 1.0, 0.5, 2.0, 1.3, 0.7, 0.1, 9.0])
+    told = sent.predict(away, position, direction, screen)
     right = sent.corrected(away, position, direction)
     points = [
         {
             "position": (position[i] * FLIP).tolist(), "direction": (direction[i] * FLIP).tolist(),
+            "focal": None if screen[i] == 1 else float(screen[i] * document["focal"]),
             "distance": _plain(away[i]), "corrected": _plain(right[i]),
             "mean": told.mean[i].tolist(), "bound": [_plain(value) for value in told.bound[i]],
             "support": float(told.support[i]),
@@ -183,6 +204,13 @@ def _promise_case(name: str, made: ViewModel, seed: int) -> Case:
 def promise_cases() -> list[Case]:
     """All cases of promises.json, in the frame of a bundle."""
     nothing = replace(model(2, 6, [1, 2, 3]), calibration=NO_CALIBRATION)
+    many = model(9, 30, [1, 2, 3, 4, 5, 6], quality="fidelity")
+    # slopes of both signs, by which thresholds overtake each other, and those that would exceed 1
+    crossing = replace(many, calibration=_with_slopes(many, [0.6, -0.4, 0.2, 0.3, 0.05, -0.1, 0.0]))
+    inputs = many.inputs.copy()
+    inputs[:, 6] = math.log(1.2)
+    one_screen = replace(many, screens=(1.2, 1.2), inputs=inputs)
+    steep = replace(many, calibration=_with_slopes(many, [0.1, 0.8, 1.5, 2.0, 4.0, 8.0, 0.0]))
     return [
         _promise_case("one view, one level", model(1, 1, [1]), 1),
         _promise_case("curves of three kinds", model(2, 6, [1, 2, 3]), 2),
@@ -192,7 +220,14 @@ def promise_cases() -> list[Case]:
         _promise_case("fidelity", model(6, 20, [1, 2, 3, 4, 5], quality="fidelity"), 6),
         _promise_case("fidelity, one level", model(7, 3, [1], quality="fidelity"), 7),
         _promise_case("no target that can be kept", nothing, 8),
+        _promise_case("thresholds that overtake each other", crossing, 9),
+        _promise_case("thresholds beyond 1", steep, 10),
+        _promise_case("one screen", one_screen, 11),
     ]
+
+
+def _with_slopes(made: ViewModel, slopes: Sequence[float]) -> Calibration:
+    return replace(made.calibration, slopes=np.array(slopes), least_support=0.0)
 
 
 def _plain(value: float) -> float | None:

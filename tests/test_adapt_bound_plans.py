@@ -23,13 +23,16 @@ def quality(mean, bound=None, kind: QualityKind = "fidelity", calibrated=(True, 
     return Quality(kind, mean, bound, np.full(mean.shape[:2], 2.0), np.array(calibrated))
 
 
+FOCAL = orbit(1)[0].focal
+
+
 def model(label: int, calibration: Calibration = NO_CALIBRATION) -> ViewModel:
     """Fidelity 0.6, 0.8 and 1 everywhere; known at the origin, looking along z."""
     curves = tuple(constant_curve(label, k + 1, v, 0.0, 1) for k, v in enumerate((0.6, 0.8, 1.0)))
-    x = np.array([[0, 0, 0, 0, 0, 1, 0]], float)
+    x = np.array([[0, 0, 0, 0, 0, 1, 0, 0]], float)
     return ViewModel(
-        label, "fidelity", curves, 1.0, 0.0, x, np.zeros(1, bool), (1.0, 1.0, 1.0), 0.0, np.zeros((1, 3)),
-        0.0, calibration,
+        label, "fidelity", curves, 1.0, 0.0, FOCAL, (0.5, 2.0), x, np.zeros(1, bool), (1.0, 1.0, 1.0, 1.0),
+        0.0, np.zeros((1, 3)), 0.0, calibration,
     )  # fmt: skip
 
 
@@ -90,7 +93,7 @@ def test_impossible_targets_are_one_line(kind, name, target):
 
 
 def test_quality_of_models_outside_of_their_support():
-    known = Calibration("calibrated", 0.95, 40, np.array([0.5, 1.0]), np.array([0.55, 1.0]), 0.2)
+    known = Calibration("calibrated", 0.95, 40, np.array([0.5, 1.0]), np.array([0.55, 1.0]), np.zeros(2), 0.2)
     cameras = [*orbit(2), orbit(1)[0]]
     cameras[0] = cameras[0].__class__(np.eye(4, dtype=np.float32), *list(vars(cameras[0]).values())[1:])
     far = np.eye(4, dtype=np.float32)

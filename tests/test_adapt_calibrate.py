@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from sagesplat.adapt.calibrate import (
     conformal_quantile,
+    critical_margins,
     critical_nominals,
-    critical_thresholds,
     fewest_views,
 )
 
@@ -36,18 +36,20 @@ def test_the_quantile_is_kept_by_new_values():
 
 @settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(1, 6))
-def test_critical_thresholds_by_trying_all(seed, levels):
+def test_critical_margins_by_trying_all(seed, levels):
     rng = np.random.default_rng(seed)
     mean = np.maximum.accumulate(rng.uniform(0, 1, (8, levels)).round(1), 1)
     measured, target = rng.uniform(0, 1, (8, levels)), 0.5
-    found = critical_thresholds(mean, measured, target)
+    scale = rng.choice([0.25, 0.5, 1.0], 8)  # exact, so that a margin gives its threshold to the bit
+    found = critical_margins(mean, measured, target, scale)
     for view in range(8):
-        for threshold in np.unique([*mean.ravel(), *(mean.ravel() + 0.01), -1, 2]):
-            reached = mean[view] >= threshold
+        margins = (mean - target) / scale[view]
+        for margin in np.unique([*margins.ravel(), *(margins.ravel() + 0.01), -9, 9]):
+            reached = margins[view] >= margin
             misses = reached.any() and measured[view, reached.argmax()] < target
-            if threshold > found[view]:
+            if margin > found[view]:
                 assert not misses
-            if threshold == found[view]:
+            if margin == found[view]:
                 assert misses
 
 

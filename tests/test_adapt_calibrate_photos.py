@@ -44,7 +44,7 @@ def test_each_multiplier_keeps_the_risk_and_a_smaller_one_does_not():
     assert (np.diff(found.thresholds) > 0).all()
     inflation = _inflation(views)[3]
     error = np.where(own.heldout, 1, inflation)[:, None] * (own.ssim - own.mean)
-    score = own.mean - found.discount * (1 - own.support)[:, None]
+    score = own.mean - found.slopes[0] * (1 - own.support)[:, None]
     for target, threshold in zip(found.targets, found.thresholds, strict=True):
         ok = score >= threshold
         accepted, level = ok.any(1), ok.argmax(1)
@@ -106,7 +106,7 @@ def test_the_discount_follows_errors_that_grow_away_from_known_views():
     flat = replace(far, ssim=own.mean + 0.02 * np.sign(rng.standard_normal((200, 1))))
     assert _slope({1: flat}) < 0.2
     one, other = calibrate_photos({1: far}, 0.95)[1], calibrate_photos({1: flat}, 0.95)[1]
-    assert one.discount > 0.1 > other.discount
+    assert one.slopes.min() > 0.1 > other.slopes.max()
     assert one.least_support == pytest.approx(0.5)
 
 
@@ -129,7 +129,7 @@ def test_changes_of_views_that_were_not_measured_are_those_of_the_nearest():
 @pytest.mark.parametrize("confidence", [1e-12, 0.01, 0.5, 0.999999, 1 - 1e-15])
 def test_any_confidence_gives_a_calibration_that_can_be_stored(confidence):
     for found in calibrate_photos({1: left_out(60, 25), 2: left_out(3, 1, std=0.0)}, confidence).values():
-        numbers = [*found.targets, *found.thresholds, found.discount, found.least_support]
+        numbers = [*found.targets, *found.thresholds, *found.slopes, found.least_support]
         assert np.isfinite(numbers).all()
         assert (np.diff(found.thresholds) > 0).all()
         assert (np.abs(found.thresholds) <= 1).all()

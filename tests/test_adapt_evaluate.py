@@ -75,6 +75,9 @@ def test_both_qualities_are_measured(capture, tmp_path: Path):
     assert full.fidelity == pytest.approx(1, abs=1e-6)  # the full model against itself
     assert (low.fidelity[low.label_id == TOTAL] < 0.99).all()
     assert full.ssim[full.label_id == TOTAL] == pytest.approx(full.full_ssim[full.label_id == TOTAL])
+    whole = full.label_id == TOTAL
+    assert full.ms_ssim[whole] == pytest.approx(full.full_ms_ssim[whole])
+    assert np.isnan(full.ms_ssim[~whole]).all()
     assert set(low.predicted[low.label_id != TOTAL]) == {0}
     assert set(photo.predicted[photo.label_id != TOTAL]) == {1}  # the same target, of the other quality
     np.testing.assert_array_equal(low.of_own_quality().ssim, low.fidelity)

@@ -76,7 +76,7 @@ def trial(models, cameras: list[Camera], seed: int, spill: float = 0.0, shown=No
 
 def made(seed: int, confidence: float = 0.95, spill: float = 0.0, views=(80, 60, 120)):
     fit, bias, calibration = (viewpoints(n, 10 * seed + i) for i, n in enumerate(views))
-    models = fit_fidelity(sampled(fit, seed), fit, 2.0, confidence)
+    models = fit_fidelity(sampled(fit, seed), fit, 2.0, confidence, 1.0, (0.5, 2.0))
     for _ in range(2):
         models = remove_composition_bias(models, trial(models, bias, 100 * seed, spill), confidence)
     models, held = hold_all_categories(models, trial(models, bias, 100 * seed, spill), confidence)
@@ -173,7 +173,7 @@ def test_a_category_that_is_never_shown_has_no_model():
     table = sampled(cameras, 0)
     pixels = table.pixels.copy()
     pixels[:, 1] = 0
-    models = fit_fidelity(replace(table, pixels=pixels), cameras, 2.0, 0.95)
+    models = fit_fidelity(replace(table, pixels=pixels), cameras, 2.0, 0.95, 1.0, (0.5, 2.0))
     assert set(models) == {3}
     planned = plan_nominal(models, LABELS, K, np.full((30, 2), np.nan, np.float32), cameras, NOMINAL)
     assert (planned[..., 1] == K).all()
@@ -182,10 +182,10 @@ def test_a_category_that_is_never_shown_has_no_model():
 def test_one_viewpoint_and_one_level():
     cameras = viewpoints(1, 0)
     table = sampled(cameras, 0)
-    models = fit_fidelity(table, cameras, 2.0, 0.95)
+    models = fit_fidelity(table, cameras, 2.0, 0.95, 1.0, (0.5, 2.0))
     assert np.isfinite(models[3].weights).all()
     single = replace(table, fidelity=table.fidelity[..., -1:], whole=table.whole[:, -1:])
-    one = fit_fidelity(single, cameras, 2.0, 0.95)[3]
+    one = fit_fidelity(single, cameras, 2.0, 0.95, 1.0, (0.5, 2.0))[3]
     position = np.zeros((1, 3))
     assert one.predict(np.array([np.nan]), position, np.array([[0.0, 0, 1]])).bound.tolist() == [[1.0]]
 
@@ -225,7 +225,7 @@ def test_damaged_samples_are_one_line(tmp_path: Path, name, value):
 
 def test_targets_between_those_that_are_calibrated():
     thresholds = np.array([0.5, 0.5 + 1e-6, 0.8])
-    steps = Calibration("calibrated", 0.95, 30, np.array([0.4, 0.6, 0.7]), thresholds, 0.0)
+    steps = Calibration("calibrated", 0.95, 30, np.array([0.4, 0.6, 0.7]), thresholds, np.zeros(3), 0.0)
     found = steps.bound(np.array([[0.3, 0.5 - 1e-9, 0.5, 0.5 + 1e-6, 0.65, 0.9]]), np.ones(1))[0]
     np.testing.assert_allclose(found, [0.2, 0.4, 0.4, 0.6, 0.65, 0.7], atol=1e-6)
     assert (np.diff(TARGETS) > 0).all()

@@ -46,7 +46,11 @@ def test_a_picture_wider_than_the_photos_is_cut_to_them():
         pinhole(), K=np.array([[50, 0, 30], [0, 60, 20], [0, 0, 1]], np.float32), width=60, height=40
     )
     lens = widest_lens([photo, replace(photo, width=30)])
-    assert lens == pytest.approx((0.6, 1 / 3))
+    shaped = np.sqrt(60 * 40 * 20 / 9 / (50 * 60)) / 2  # the longer side of a phone's picture of that area
+    assert lens == pytest.approx((shaped, shaped))
+    assert widest_lens([replace(photo, width=200)])[0] == pytest.approx(2.0)
+    assert widest_lens([replace(photo, width=200)])[1] == pytest.approx(shaped * np.sqrt(200 / 60))
+    lens = (0.6, 1 / 3)
     assert within_lens(photo, lens) is photo
     assert within_lens(photo.resized(600, 400), lens).width == 600
     middle = np.array([[50, 0, 20], [0, 60, 45], [0, 0, 1]], np.float32)
@@ -55,7 +59,6 @@ def test_a_picture_wider_than_the_photos_is_cut_to_them():
     assert (cut.width, cut.height) == (40, 40)  # around the principal point
     assert cut.K[:2, 2].tolist() == [20, 20]
     assert (cut.w2c == phone.w2c).all()
-    assert widest_lens([cut]) == pytest.approx((0.4, 1 / 3))
 
 
 def test_measure_takes_means_of_the_map_over_each_mask():

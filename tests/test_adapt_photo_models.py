@@ -102,7 +102,7 @@ def test_labels_with_hardly_any_data():
             near = predicted.support >= model.calibration.least_support
             assert np.isfinite(predicted.bound[near]).all() or not len(model.calibration.targets), label
         assert model.predict(d[:0], position[:0], direction[:0]).bound.shape == (0, len(model.levels))
-        assert np.isfinite([model.calibration.discount, *model.calibration.thresholds]).all()
+        assert np.isfinite([*model.calibration.slopes, *model.calibration.thresholds]).all()
     exact = models[5].predict(d, position, direction)
     assert np.nanmax(exact.bound) <= 0.7 + 1e-6
     costs = {(label, level): level for label, model in models.items() for level in model.levels}

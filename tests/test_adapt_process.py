@@ -19,7 +19,7 @@ from sagesplat.adapt.process import (
 
 def drawn(n: int = 20, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return rng.standard_normal((n, 7)), np.arange(n) % 3 == 0, 0.1 * rng.standard_normal((n, 2))
+    return rng.standard_normal((n, 8)), np.arange(n) % 3 == 0, 0.1 * rng.standard_normal((n, 2))
 
 
 def squares_of(x: np.ndarray) -> list[np.ndarray]:
@@ -42,11 +42,11 @@ def test_slopes_of_the_covariance():
     x, u, _ = drawn(6)
     theta, squares = PRIOR + 0.3, squares_of(x)
     S, slopes = _terms(squares, u, theta)
-    lengths = [float(np.exp(t)) for t in theta[:3]]
-    whole = matern32(x, x, lengths) + np.exp(theta[3]) * np.outer(u, u) + np.exp(theta[4]) * np.eye(6)
+    lengths = [float(np.exp(t)) for t in theta[:4]]
+    whole = matern32(x, x, lengths) + np.exp(theta[4]) * np.outer(u, u) + np.exp(theta[5]) * np.eye(6)
     np.testing.assert_allclose(S, whole, atol=1e-12)
     for i, slope in enumerate(slopes):
-        step = 1e-6 * (np.arange(5) == i)
+        step = 1e-6 * (np.arange(6) == i)
         up, down = (_terms(squares, u, theta + sign * step)[0] for sign in (1, -1))
         np.testing.assert_allclose(slope, (up - down) / 2e-6, atol=1e-7)
 
@@ -56,8 +56,8 @@ def test_slopes_of_the_likelihood():
     for shift in (-0.5, 0.0, 0.4):
         theta = PRIOR + shift
         slope = _cost(theta, squares_of(x), u, values)[1]
-        for i in range(5):
-            step = 1e-6 * (np.arange(5) == i)
+        for i in range(6):
+            step = 1e-6 * (np.arange(6) == i)
             up, down = (_cost(theta + sign * step, squares_of(x), u, values)[0] for sign in (1, -1))
             # the amplitude's own dependence on theta adds nothing but for the floor under it
             assert slope[i] == pytest.approx((up - down) / 2e-6, rel=0.02, abs=0.02)
@@ -69,9 +69,9 @@ def test_hyperparameters_are_the_best_near_by_and_within_bounds():
     theta = np.log([*process.lengths, process.heldout_variance, process.noise])
     assert (np.abs(theta - PRIOR) <= PRIOR_REACH * PRIOR_WIDTH + 1e-9).all()
     best = _cost(theta, squares_of(x), u, values)[0]
-    for i in range(5):
+    for i in range(6):
         for step in (-0.2, 0.2):
-            assert _cost(theta + step * (np.arange(5) == i), squares_of(x), u, values)[0] > best - 0.05
+            assert _cost(theta + step * (np.arange(6) == i), squares_of(x), u, values)[0] > best - 0.05
 
 
 def test_one_view_and_views_in_one_place():
@@ -89,4 +89,7 @@ def test_an_unknown_distance_counts_as_the_median():
     distance = np.array([2.0, np.nan, 0.0, -1.0, np.inf])
     where = np.zeros((5, 3)), np.ones((5, 3))
     x = inputs_of(distance, *where, 2.0, 0.7)
-    np.testing.assert_allclose(x[:, 6], [np.log(2), 0.7, 0.7, 0.7, 0.7])
+    np.testing.assert_allclose(x[:, 7], [np.log(2), 0.7, 0.7, 0.7, 0.7])
+    np.testing.assert_array_equal(x[:, 6], 0)  # no screen: the photos'
+    screens = inputs_of(distance, *where, 2.0, 0.7, np.full(5, 2.0))
+    np.testing.assert_allclose(screens[:, 6], np.log(2))

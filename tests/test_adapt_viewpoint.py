@@ -27,7 +27,7 @@ from sagesplat.io.typed import to_plain
 
 SCENE = orbit(160)
 CALIBRATION = Calibration(
-    "calibrated", 0.95, 40, np.array([0.6, 0.7, 0.8]), np.array([0.62, 0.75, 0.81]), 0.1, 0.02
+    "calibrated", 0.95, 40, np.array([0.6, 0.7, 0.8]), np.array([0.62, 0.75, 0.81]), np.full(3, 0.02), 0.1
 )
 
 
@@ -40,7 +40,7 @@ def test_formulas_of_the_module_text(model):
     """What a viewer computes from promises.json, written out for one viewpoint."""
     entry = json.loads(json.dumps(to_plain(model)))
     distance, position, direction = viewpoints(SCENE, SCENE.test_ids[:1])
-    x = np.array([*position[0] / entry["extent"], *direction[0], np.log(distance[0])])
+    x = np.array([*position[0] / entry["extent"], *direction[0], 0.0, np.log(distance[0])])
     X, u = np.array(entry["inputs"]), np.array(entry["heldout_inputs"], float)
 
     def c(a, b):
@@ -55,8 +55,11 @@ def test_formulas_of_the_module_text(model):
     np.testing.assert_allclose(predicted.mean[0], mean, rtol=1e-9)
     assert predicted.support[0] == pytest.approx(near.max(), rel=1e-9)
     calibration = entry["calibration"]
-    thresholds, targets = calibration["thresholds"], calibration["targets"]
-    for i, one in enumerate(mean - calibration["discount"] * (1 - near.max())):
+    targets, slopes = calibration["targets"], calibration["slopes"]
+    thresholds = [
+        t + slope * (1 - near.max()) for t, slope in zip(calibration["thresholds"], slopes, strict=True)
+    ]
+    for i, one in enumerate(mean):
         above = sum(one >= t for t in thresholds)
         if above == 0:
             bound = one - thresholds[0] + targets[0]
@@ -83,11 +86,19 @@ def test_less_is_said_away_from_what_is_known(model):
 
 def test_the_bound_of_a_mean_by_hand():
     means = np.array([[0.5, 0.62, 0.685, 0.81, 0.99]])
-    plain = replace(CALIBRATION, discount=0.0)
+    plain = replace(CALIBRATION, slopes=np.zeros(3))
     np.testing.assert_allclose(plain.bound(means, np.ones(1)), [[0.48, 0.6, 0.65, 0.8, 0.8]])
-    # a discount counts where the support lacks
+    # slopes count where the support lacks
     halfway = CALIBRATION.bound(means + 0.01, np.array([0.5]))
     np.testing.assert_allclose(halfway, plain.bound(means, np.ones(1)))
+    # thresholds never fall from target to target, and the full model keeps all of them
+    steep = replace(CALIBRATION, thresholds=np.array([0.62, 0.75, 1.0]), slopes=np.array([0.5, 0.0, 0.0]))
+    np.testing.assert_allclose(
+        steep.bound(np.array([[0.5, 0.869, 0.87, 0.935, 1.0]]), np.array([0.5]))[0],
+        [0.23, 0.599, 0.7, 0.75, 0.8],
+    )
+    far = replace(steep, slopes=np.array([0.0, 3.0, 0.0]), least_support=0.0)
+    np.testing.assert_allclose(far.bound(np.array([[0.81, 1.0]]), np.zeros(1))[0], [0.65, 0.8])
     assert np.isnan(CALIBRATION.bound(means, np.array([0.05]))).all()
     assert np.isnan(NO_CALIBRATION.bound(means, np.ones(1))).all()
 
@@ -122,9 +133,10 @@ def test_round_trip(tmp_path, model):
         {"heldout_variance": -1}, {"lengths": [1, 1]}, {"weights": [[1.0]]}, {"curves": []},
         {"inputs": []}, {"extent": 0}, {"quality": "good"}, {"rmse": None}, {"calibration": {}},
         {"calibration": {"targets": [0.6, 0.6, 0.8]}}, {"calibration": {"thresholds": [0.1, 0.2, math.nan]}},
-        {"calibration": {"targets": [0.6, 0.7]}}, {"calibration": {"thresholds": [0.1, 0.2, 2]}},
+        {"calibration": {"targets": [0.6, 0.7]}}, {"calibration": {"thresholds": [0.1, 0.2, 1e31]}},
         {"calibration": {"confidence": 1}}, {"calibration": {"least_support": 2}},
-        {"calibration": {"discount": math.inf}},
+        {"calibration": {"slopes": [0, 0, math.inf]}}, {"calibration": {"slopes": [0.0]}},
+        {"screens": [2, 1]}, {"focal": 0},
     ],
 )  # fmt: skip
 def test_spoilt_files_are_one_line(tmp_path, model, change):

@@ -52,7 +52,7 @@ def test_draws_depend_on_their_own_number_only():
 
 def test_viewpoints_lie_between_neighbours_and_close_to_them():
     base = capture_cameras(SCENE)
-    rule = Rule(neighbours=2, shift=0.02, turn=0.03)
+    rule = Rule(neighbours=2, shift=0.02, turn=0.03, places=(1, 0, 0))
     drawn = draw(SCENE, base, rule, {"fit": 200})
     positions = np.stack([camera.position for camera in base])
     # on an arc each camera's two neighbours are the ones beside it
@@ -65,7 +65,7 @@ def test_viewpoints_lie_between_neighbours_and_close_to_them():
         assert nearest <= 3 * rule.shift * SCENE.extent  # ends have their neighbours on one side
         turned = [Rotation.from_matrix(camera.w2c[:3, :3] @ c.w2c[:3, :3].T).magnitude() for c in base]
         assert min(turned) < 0.08 + np.sqrt(3) * rule.turn
-    still = draw(SCENE, base, Rule(neighbours=0, shift=0, turn=0), {"fit": 30})
+    still = draw(SCENE, base, Rule(neighbours=0, shift=0, turn=0, places=(1, 0, 0)), {"fit": 30})
     near = np.abs(poses(still.cameras)[:, None] - poses(base)).max((2, 3)).min(1)
     assert near.max() < 1e-6
 
@@ -76,10 +76,10 @@ def test_no_viewpoint_inside_of_something():
         0, 1e-3, (50, 3)
     )
     blocked = scene(cameras, np.concatenate([wall, [[0, 0, 4]]]))
-    drawn = draw(blocked, capture_cameras(blocked), Rule(shift=0.001), {"fit": 200})
+    drawn = draw(blocked, capture_cameras(blocked), Rule(shift=0.001, places=(0.5, 0.5, 0)), {"fit": 200})
     away = np.array([np.linalg.norm(wall - camera.position, axis=1).min() for camera in drawn.cameras])
     own = np.array([np.linalg.norm(wall - camera.position, axis=1).min() for camera in cameras])
-    assert away.min() > 0.49 * own.min()
+    assert away.min() > 0.49 * min(own.min(), np.quantile(own, 0.1))
 
 
 def test_test_photos_are_not_drawn_from():
@@ -104,11 +104,76 @@ def test_rules_that_cannot_be_followed(rule):
         draw(SCENE, capture_cameras(SCENE), rule, {"fit": 1})
 
 
+@pytest.mark.parametrize(
+    ("rule", "says"),
+    [
+        (Rule(screens=(2.0, 0.5)), r"^--sample\.screens 2 0\.5: from the smaller to the larger: 0\.5 2$"),
+        (Rule(screens=(0.0, 1.0)), r"--sample\.screens 0\.0 1\.0 is impossible"),
+        (Rule(screens=(1.0, 1e6)), r"--sample\.screens 1\.0 1000000\.0 is impossible"),
+        (Rule(places=(0, 0, 0)), r"^--sample\.places 0 0 0: no viewpoints anywhere"),
+        (Rule(places=(0.5, -0.1, 0)), r"--sample\.places 0\.5 -0\.1 0 is impossible"),
+    ],
+)
+def test_screens_and_places_that_cannot_be(rule, says):
+    with pytest.raises(RunError, match=says):
+        draw(SCENE, capture_cameras(SCENE), rule, {"fit": 1})
+
+
+def test_screens_are_log_uniform_and_keep_the_field_of_view_or_the_area():
+    cameras = orbit(12)
+    drawn = draw(scene(cameras), cameras, Rule(screens=(0.5, 2.0)), {"fit": 400}).cameras
+    s = np.array([camera.focal for camera in drawn]) / cameras[0].focal
+    assert (s >= 0.5 - 1e-6).all()
+    assert (s <= 2 + 1e-6).all()
+    np.testing.assert_allclose(np.quantile(np.log2(s), [0.1, 0.5, 0.9]), [-0.8, 0, 0.8], atol=0.12)
+    size = np.array([(camera.width, camera.height) for camera in drawn])
+    own = np.array([cameras[0].width, cameras[0].height])
+    kept = (np.abs(size - s[:, None] * own) <= 0.5 + 1e-4).all(1)
+    assert 0.4 < kept.mean() < 0.65
+    np.testing.assert_allclose(size.prod(1), s**2 * own.prod(), rtol=0.12)
+    assert (size[:, 0] < size[:, 1]).mean() > 0.15  # portrait
+    for camera, same in zip(drawn, kept, strict=True):
+        if not same:
+            np.testing.assert_allclose(camera.K[:2, 2], [camera.width / 2, camera.height / 2])
+
+
+def test_places_are_on_the_path_among_the_cameras_and_behind_them():
+    cameras = orbit(24)
+    points = np.random.default_rng(0).normal([0, 0, 4], 0.3, (400, 3))
+    where = scene(cameras, points)
+    base = capture_cameras(where)
+    positions = np.stack([camera.position for camera in base])
+
+    def drawn(*places: float) -> list[Camera]:
+        return list(draw(where, base, Rule(places=places), {"fit": 100}).cameras)
+
+    up = poses(base)[:, 1, :3].mean(0)
+    low, high = positions.min(0), positions.max(0)
+    grown = 0.1 * (high - low) + 0.11 * where.extent
+    for camera in drawn(0, 1, 0):
+        assert ((camera.position > low - grown) & (camera.position < high + grown)).all()
+        assert abs(camera.w2c[0, :3] @ up) < 1e-5  # no roll
+        middle = np.median(points, 0) - camera.position
+        assert camera.direction @ middle / np.linalg.norm(middle) > 0.9
+    for camera in drawn(0, 0, 1):
+        same = int(np.abs(poses(base)[:, :3, :3] - camera.w2c[:3, :3]).max((1, 2)).argmin())
+        depth = (points - positions[same]) @ base[same].direction
+        moved = positions[same] - camera.position
+        assert np.linalg.norm(moved) <= np.median(depth[depth > 0]) + 1e-4
+        np.testing.assert_allclose(moved, (moved @ base[same].direction) * base[same].direction, atol=1e-4)
+    mixed = poses(draw(where, base, Rule(places=(0.4, 0.4, 0.2)), {"fit": 200}).cameras)
+    turned = np.abs(mixed[:, None, :3, :3] - poses(base)[None, :, :3, :3]).max((2, 3)).min(1)
+    assert 0.1 < (turned < 1e-6).mean() < 0.3  # those that step back have a camera's own rotation
+
+
 def test_files_come_back(tmp_path):
-    drawn = draw(SCENE, capture_cameras(SCENE), Rule(7, 2, 0.1, 0.2), {"fit": 3, "calibration": 2})
+    base = capture_cameras(SCENE)
+    base_focal = np.median([camera.focal for camera in base])
+    drawn = draw(SCENE, base, Rule(7, 2, 0.1, 0.2, (0.3, 1.5)), {"fit": 3, "calibration": 2})
     write_viewpoints(tmp_path / "v.json", drawn)
     back = read_viewpoints(tmp_path / "v.json")
     assert (back.rule, back.sets, back.source) == (drawn.rule, drawn.sets, "capture")
+    assert back.focal == drawn.focal == pytest.approx(base_focal)
     assert (poses(back.cameras) == poses(drawn.cameras)).all()
     assert [c.K.tolist() for c in back.cameras] == [c.K.tolist() for c in drawn.cameras]
     assert (poses(read_cameras(tmp_path / "v.json", SCENE.views[0].camera)) == poses(drawn.cameras)).all()

@@ -158,7 +158,7 @@ def test_headline_is_computed_from_unseen_views(written):
 
 def test_files_beside_the_page(written):
     path, data, _ = written
-    figure_names = {"size_by_target", "quality_over_size", "promised_and_measured"}
+    figure_names = {"size_by_target", "quality_over_size", "asked_and_measured"}
     figure_names |= {"ssim_over_levels", "ssim_over_distance"}
     assert {f.stem for f in (path.parent / "figures").glob("*.svg")} == figure_names
     for name in figure_names | {"panel_0", "panel_1"}:
@@ -262,7 +262,7 @@ def whole_page() -> ReportData:
         links=[("Its bundle", "../../bundle/index.html"), ("The paper's tables", "paper/index.html")],
         place=place,
         drawn=drawn,
-        promise=PromiseFacts(0.95, 57, 27, 83),
+        promise=PromiseFacts(0.95, 57, 27, 83, "screens of 0.5 to 2 times the photos' focal length"),
         settings=[("train.max_steps", "1000")],
         provenance=[("sha256 of scene.json", "f" * 64)],
     )

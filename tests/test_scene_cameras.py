@@ -57,7 +57,7 @@ def test_cameras_of_3dgs(tmp_path):
 
 
 def test_viewpoints_of_a_run(tmp_path):
-    write_viewpoints(tmp_path / "v.json", Viewpoints(Rule(), "capture", tuple(CAMERAS), ("fit",) * 4))
+    write_viewpoints(tmp_path / "v.json", Viewpoints(Rule(), "capture", 50.0, tuple(CAMERAS), ("fit",) * 4))
     found = read_camera_file(tmp_path / "v.json")
     assert_as_drawn(found)
     assert found[1].camera.K.tolist() == CAMERAS[1].K.tolist()

@@ -75,14 +75,18 @@ def test_a_camera_is_planned_for_fidelity_by_default(runs):
     assert all(c.calibrated is None for c in lost.choices)
 
 
-def test_a_phone_knows_the_distances_of_the_photos(runs):
+def test_a_higher_window_knows_the_distances_of_the_highest_shape(runs):
     run = runs["nested"]
     photo = run.scene.views[0].camera
-    K = photo.K.copy()
-    K[1, 2] += photo.height
-    phone = replace(photo, K=K, height=3 * photo.height)
-    wanted = {c.label_id: c.distance for c in run.plan_camera(photo).choices}
-    found = {c.label_id: c.distance for c in run.plan_camera(phone).choices}
+
+    def distances(times: float) -> dict[int, float]:
+        K = photo.K.copy()
+        height = round(times * photo.height)
+        K[1, 2] += (height - photo.height) / 2
+        choices = run.plan_camera(replace(photo, K=K, height=height)).choices
+        return {choice.label_id: choice.distance for choice in choices}
+
+    wanted, found = distances(3), distances(5)  # shapes go up to about 1.7
     assert any(map(math.isfinite, wanted.values()))
     for label, distance in wanted.items():
         if math.isfinite(distance):  # else it is only on the phone

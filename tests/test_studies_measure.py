@@ -17,7 +17,10 @@ from sagesplat.core.events import Event, TableMade, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_increments, read_index, shown
 from sagesplat.formats.ply import write_ply
+from sagesplat.metrics import flip
+from sagesplat.metrics.flip import flip_map
 from sagesplat.metrics.image import psnr, ssim_map
+from sagesplat.metrics.ms_ssim import ms_ssim
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -40,7 +43,7 @@ def files(tmp_path: Path) -> Path:
     write_ply(tmp_path / "full.ply", FULL, NAMES)
     write_ply(tmp_path / "same.ply", FULL, NAMES)
     write_ply(tmp_path / "third.ply", third())
-    drawn = Viewpoints(Rule(), "capture", tuple(orbit(VIEWS)), ("fit",) * VIEWS)
+    drawn = Viewpoints(Rule(), "capture", 50.0, tuple(orbit(VIEWS)), ("fit",) * VIEWS)
     write_viewpoints(tmp_path / "views.json", drawn)
     return tmp_path
 
@@ -69,12 +72,43 @@ def test_files_against_a_file(files):
         a, b = (rasterize(g, camera).rgb.clamp(0, 1).numpy().copy() for g in (third(), FULL))
         assert row.ssim == pytest.approx(float(ssim_map(a, b).mean()), abs=1e-6)
         assert row.psnr == pytest.approx(float(psnr(np.square(a - b).mean())), abs=1e-4)
+        assert row.others["MS-SSIM"] == pytest.approx(ms_ssim(a, b), abs=1e-5)
     assert max(row.ssim for row in found.of(1, TOTAL)) < 0.9
     assert found.labels() == [3, 184] or found.labels() == [184, 3]
     assert {found.region(label) for label in found.labels()} == {"car", "tree"}
     titles = [event.title for event in events if isinstance(event, TableMade)]
     assert titles == ["Levels against full.ply, means over 3 viewpoints", "SSIM by category"]
-    assert [e.text[:15] for e in events if isinstance(e, Warned)] == ["no LPIPS (alex)", "no LPIPS (vgg):"]
+    assert [e.text[:15] for e in events if isinstance(e, Warned) and "LPIPS" in e.text] == [
+        "no LPIPS (alex)",
+        "no LPIPS (vgg):",
+    ]
+
+
+def test_flip_is_measured_where_it_is(files):
+    pytest.importorskip("flip_evaluator", reason="needs the extra flip")
+    paths = [files / name for name in ("full.ply", "same.ply", "third.ply")]
+    found = measure(paths, files / "out", settings(files), ignore)
+    assert found.others == ["MS-SSIM", "FLIP"]
+    camera = orbit(VIEWS)[0]
+    a, b = (rasterize(g, camera).rgb.clamp(0, 1).numpy().copy() for g in (third(), FULL))
+    assert found.of(1, TOTAL)[0].others["FLIP"] == pytest.approx(float(flip_map(a, b).mean()), abs=1e-5)
+    assert found.of(0, TOTAL)[0].others["FLIP"] < 1e-3
+    table = levels_table(found)
+    assert float(table.rows[1][table.header.index("FLIP")]) > 0.01
+    assert "67 pixels per degree" in table.notes[1]
+    level = json.loads((files / "out" / "measure.json").read_text())["levels"][0]
+    assert level["MS-SSIM"] == pytest.approx(1, abs=1e-5)
+    assert level["FLIP"] < 1e-3
+
+
+def test_without_flip_one_line_says_so(files, monkeypatch):
+    monkeypatch.setattr(flip, "find_spec", lambda name: None)
+    events: list[Event] = []
+    found = measure([files / "full.ply", files / "third.ply"], files / "out", settings(files), events.append)
+    assert found.others == ["MS-SSIM"]
+    (line,) = [e.text for e in events if isinstance(e, Warned) and "FLIP" in e.text]
+    assert line.startswith("no FLIP: flip-evaluator is not installed; ")
+    assert "sagesplat[flip]" in line
 
 
 def test_an_empty_background_does_not_count_as_covered(files):
@@ -157,7 +191,7 @@ def test_cameras_of_another_scene(files):
     away = [
         replace(camera, w2c=camera.w2c @ np.diag([-1, 1, -1, 1]).astype(np.float32)) for camera in orbit(2)
     ]
-    write_viewpoints(files / "away.json", Viewpoints(Rule(), "capture", tuple(away), ("fit",) * 2))
+    write_viewpoints(files / "away.json", Viewpoints(Rule(), "capture", 50.0, tuple(away), ("fit",) * 2))
     config = settings(files, cameras=files / "away.json")
     with pytest.raises(RunError, match=r"away\.json: no camera has full\.ply in sight; give cameras of this"):
         measure([files / "full.ply", files / "third.ply"], files / "out", config, ignore)

@@ -139,7 +139,7 @@ def three_walls(folder: Path, **increments: Any) -> Contents:
 
 
 @pytest.fixture(scope="module")
-def promised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle whose categories have models of both qualities; one is not calibrated."""
     folder = tmp_path_factory.mktemp("promised")
     contents = three_walls(folder)
@@ -148,15 +148,16 @@ def promised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
     def models(label: int) -> dict[QualityKind, ViewModel]:
         inputs = np.array(
-            [[*camera.position, *camera.direction, np.log(5)] for camera in cameras], np.float64
+            [[*camera.position, *camera.direction, 0.0, np.log(5)] for camera in cameras], np.float64
         )
         found: dict[QualityKind, ViewModel] = {}
         for quality in ("fidelity", "ssim"):
             made = model(label, len(cameras), [1, 2, 3, 4], quality=quality, unseen=False)
             status = "uncalibrated" if label == 2 else "calibrated"
             found[quality] = replace(
-                made, label_id=label, inputs=inputs, extent=1.0, lengths=(2.0, 2.0, 2.0),
-                weights=made.weights * 0, calibration=replace(made.calibration, status=status),
+                made, label_id=label, inputs=inputs, extent=1.0, focal=camera().focal, lengths=(2.0,) * 4,
+                weights=made.weights * 0,
+                calibration=replace(made.calibration, status=status, slopes=made.calibration.slopes * 0),
             )  # fmt: skip
         return found
 
@@ -165,7 +166,12 @@ def promised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         for c in contents.categories
     ]
     write_bundle(folder / "bundle", replace(contents, categories=categories, drawn=cameras), package_viewer())
-    with serve(folder / "bundle") as url:
+    return folder / "bundle"
+
+
+@pytest.fixture(scope="module")
+def promised(promised_bundle: Path) -> Iterator[str]:
+    with serve(promised_bundle) as url:
         yield url
 
 
@@ -488,6 +494,47 @@ def test_fidelity_is_promised_and_the_photos_are_a_choice(promised: str, browser
         opened.wait_for("sagesplat.state().labels.every((l) => l.promised === 1)")
         assert page.evaluate("sagesplat.settings().target") == 0.95
         assert opened.complaints == []
+
+
+@pytest.mark.slow
+def test_promises_are_for_screens_and_a_window_that_changes_is_another(promised: str, browser: Any) -> None:
+    def here(shorter: float, tan: float) -> float:
+        """Waits for the screen of a window whose shorter side is seen under half an angle of this tangent."""
+        screen = shorter / 2 / tan / camera().focal
+        opened.wait_for(f"Math.abs(sagesplat.state().screens?.here - {screen}) < 1e-4")  # focal is rounded
+        return screen
+
+    usual = np.tan(np.pi / 6)
+    known = "Promises are for screens of 0.5 to 2 times the photos' sharpness"
+    said = "document.querySelector('.screens').textContent"
+    with open_page(promised, (900, 640), browser=browser) as opened:
+        ready(opened)
+        averaged = round(640 * 2 / here(640, usual))
+        opened.wait_for(f'{said} === "{known}; compared as averaged down to {averaged} px"')
+        for width, height in ((900, 400), (360, 640)):  # the second as on a phone that was turned
+            opened.page.set_viewport_size({"width": width, "height": height})
+            here(min(width, height), usual)
+            opened.wait_for(f'{said} === "{known}"')
+        opened.page.evaluate("sagesplat.setPose({ ...sagesplat.pose(), fovY: 0.5 })")
+        here(640, np.tan(0.25))
+        assert opened.complaints == []
+
+
+@pytest.mark.slow
+def test_nothing_is_promised_while_a_category_in_sight_is_missing(
+    promised_bundle: Path, browser: Any
+) -> None:
+    brick = json.loads((promised_bundle / "manifest.json").read_text())["labels"][0]["levels"][0]
+    with (
+        serve(promised_bundle, {brick["uri"]: None, ".pack": None}) as url,
+        open_page(url, (900, 640), browser=browser) as opened,
+    ):
+        ready(opened)
+        opened.wait_for("sagesplat.state().labels.slice(1).every((l) => l.promised > 0)")
+        opened.wait_for("sagesplat.state().labels[0].error")
+        assert opened.page.evaluate("Number.isNaN(sagesplat.state().labels[0].promised)")
+        opened.page.evaluate(FRAMES, 30)
+        assert "≥" not in opened.page.inner_text(".summary")
 
 
 @pytest.mark.slow

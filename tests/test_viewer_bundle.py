@@ -183,10 +183,11 @@ def test_curves_keep_what_they_say(seed: int) -> None:
         np.testing.assert_allclose(read(away), curve(away), atol=2e-4)
 
 
-def own_views(made: ViewModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance, position and direction of a model's views."""
-    distance = np.exp(made.inputs[:, 6]) * (1 + 1e-9)  # a curve may jump exactly there
-    return distance, made.inputs[:, :3] * made.extent, made.inputs[:, 3:6]
+def own_views(made: ViewModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Distance, position, direction and screen of a model's views."""
+    inputs = made.inputs
+    distance = np.exp(inputs[:, 7]) * (1 + 1e-9)  # a curve may jump exactly there
+    return distance, inputs[:, :3] * made.extent, inputs[:, 3:6], np.exp(inputs[:, 6])
 
 
 def assert_close_means(read: SentModel, made: ViewModel, *at: np.ndarray) -> None:
@@ -220,6 +221,30 @@ def test_a_model_that_is_sent_predicts_the_same(quality, seed: int, views: int) 
     assert_close_means(read, made, *nowhere)
 
 
+@pytest.mark.parametrize("slopes", [[0.1, -0.6, 0.3, 0.5, -0.2, 2.0, 0.0], [3.0] * 6 + [0.0]])
+def test_thresholds_that_rise_and_fall_with_the_support_promise_no_more_when_sent(slopes) -> None:
+    made = model(6, 20, [1, 2, 3, 4], quality="fidelity")
+    made = replace(made, calibration=replace(made.calibration, slopes=np.array(slopes)))
+    read = read_model(sent(made), made.label_id)
+    distance, position, direction, screen = own_views(made)
+    for at in (own_views(made), (distance, position, direction, screen * 1.3)):
+        before, after = made.predict(*at), read.predict(*at)
+        asked = before.bound >= made.calibration.targets[0]
+        assert (after.bound <= before.bound + 1e-12)[asked].all()
+        assert (after.bound[:, -1] == 1).all()
+
+
+def test_screens_beyond_those_that_are_known_count_as_the_nearer_end() -> None:
+    made = model(6, 20, [1, 2, 3, 4], quality="fidelity")
+    read, at = read_model(sent(made), made.label_id), own_views(made)[:3]
+    for one in (made, read):
+        for inside, beyond in ((2.0, 9.0), (0.5, 0.01)):
+            known, told = (one.predict(*at, np.full(20, screen)) for screen in (inside, beyond))
+            np.testing.assert_array_equal(known.bound, told.bound)
+        np.testing.assert_array_equal(one.predict(*at).mean, one.predict(*at, np.ones(20)).mean)
+        assert np.abs(one.predict(*at, np.full(20, 2.0)).mean - one.predict(*at).mean).max() > 1e-3
+
+
 def test_of_very_many_views_some_are_sent_and_thresholds_allow_for_it(monkeypatch) -> None:
     made = model(5, 40, [1, 2, 4])
     monkeypatch.setattr(promises, "MOST_VIEWS", 16)
@@ -232,12 +257,12 @@ def test_of_very_many_views_some_are_sent_and_thresholds_allow_for_it(monkeypatc
     assert (after.bound <= before.bound + 1e-12)[asked].all()
 
 
-def test_thresholds_that_are_close_stay_apart_and_below_the_full_model() -> None:
+def test_thresholds_that_are_close_never_promise_more() -> None:
     targets = np.array([0.5, 0.6, 0.7, 0.98, 1.0])
     close = np.array([0.5, 0.50000001, 0.50000002, 0.99999999, 1.0])
     made = replace(
         model(3, 12, [1, 2], quality="fidelity"),
-        calibration=Calibration("uncalibrated", 0.95, 3, targets, close, 0.123456),
+        calibration=Calibration("uncalibrated", 0.95, 3, targets, close, np.zeros(5), 0.123456),
     )
     (entry,) = sent(made)["labels"]
     assert entry["targets"][:3] == [5000, 6000, 7000]
@@ -246,11 +271,11 @@ def test_thresholds_that_are_close_stay_apart_and_below_the_full_model() -> None
     below = np.linspace(0.51, 0.9997, 200)[None]  # targets of the full model lend nothing to what is below it
     assert (read.bound(below, np.ones(1)) <= made.calibration.bound(below, np.ones(1)) + 1e-9).all()
     assert entry["thresholds"][-1] == 10000
-    assert (np.diff(entry["thresholds"]) > 0).all()
+    assert (np.diff(entry["thresholds"][:4]) >= 0).all()
     assert entry["leastSupport"] == 0.1235  # up: no promise that was not given
     assert entry["status"] == "uncalibrated"
     nothing = sent(replace(made, calibration=NO_CALIBRATION))
-    assert nothing["labels"][0]["targets"] == nothing["labels"][0]["thresholds"] == []
+    assert [nothing["labels"][0][name] for name in ("targets", "thresholds", "slopes")] == [[], [], []]
     assert np.isnan(read_model(nothing, 7).predict(*own_views(made)).bound).all()
 
 
@@ -275,10 +300,10 @@ def test_the_first_view_is_level() -> None:
 
 
 def test_known_views_correct_the_boxes() -> None:
-    made = replace(model(2, 12, [1]), lengths=(0.05, 0.05, 1.0))  # no view is close to another
+    made = replace(model(2, 12, [1]), lengths=(0.05, 0.05, 1.0, 1.0))  # no view is close to another
     missed = np.linspace(-0.5, 0.5, 12)
     read = read_model(sent(made, Seen(np.zeros(12), np.zeros(12), missed)), 7)
-    _, position, direction = own_views(made)
+    _, position, direction, _ = own_views(made)
     told = np.linspace(1, 3, 12)
     right = read.corrected(told, position, direction)
     np.testing.assert_allclose(right, told * np.exp(missed), rtol=3e-3)
@@ -396,10 +421,11 @@ def test_promises_know_the_model_s_views_and_shares(contents, quality, share) ->
     promises = json.loads(documents(contents)[1][quality])
     made, (entry,) = contents.categories[1].models[quality], promises["labels"]
     views = np.cumsum(promises["views"], 1).T / 1e4
+    assert (promises["focal"], promises["screens"]) == (made.focal, list(made.screens))
     assert len(views) == made.num_views  # the test photo taught nothing
     assert np.cumsum(entry["shares"]).tolist() == [share * 1e4] * len(views)
-    inputs = read_model(promises, 3).inputs[:, :6].round(3)
-    wanted = sorted(map(tuple, made.inputs[:, :6].round(3).tolist()))
+    inputs = read_model(promises, 3).inputs[:, :7].round(3)
+    wanted = sorted(map(tuple, made.inputs[:, :7].round(3).tolist()))
     np.testing.assert_allclose(sorted(map(tuple, inputs.tolist())), wanted, atol=2e-3)
 
 
@@ -477,7 +503,8 @@ def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewe
 
 def test_in_the_pack_what_the_first_view_skips_comes_last() -> None:
     made = replace(model(2, 6, [1, 2, 3, 4]), weights=np.zeros((6, 4)))
-    made = replace(made, inputs=np.tile([0, 0, 0, 0, 0, 1.0, math.log(5)], (6, 1)))  # where it is looked from
+    here = [0, 0, 0, 0, 0, 1.0, 0, math.log(5)]  # where it is looked from
+    made = replace(made, inputs=np.tile(here, (6, 1)))
     flat = replace(made.curves[0], params=replace(made.curves[0].params, g1=0, g2=0))
     means = (0.3, 0.62, 0.9, 0.95)
     curves = tuple(

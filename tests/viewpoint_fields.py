@@ -74,7 +74,7 @@ def synthetic(
     rows = np.arange(len(scene.views))
     distance, position, direction = viewpoints(scene, rows)
     x = inputs_of(distance, position, direction, scene.extent, 0.0)
-    S = matern32(x, x, (0.5, 0.5, 1.0)) + 1e-9 * np.eye(len(x))
+    S = matern32(x, x, (0.5, 0.5, 1.0, 1.0)) + 1e-9 * np.eye(len(x))
     field = 0.05 * np.linalg.cholesky(S) @ rng.standard_normal((len(x), 2))
     unseen = ~np.isin(rows, scene.train_ids)
     level = np.array([0.55, 0.66, 0.76, 0.85])

@@ -5,7 +5,7 @@ import type { Quality } from "./types";
 import { openViewer } from "./view/open";
 import { embed } from "./view/viewer";
 
-export type { Camera, Label, LabelState, Level, Pose, Quality, Settings, State } from "./types";
+export type { Camera, Label, LabelState, Level, Pose, Quality, Screens, Settings, State } from "./types";
 export type { Embed, Sample };
 
 /** What to show. */

@@ -159,8 +159,12 @@ export interface Camera {
 export interface Promises {
   quality: Quality;
   extent: number;
-  /** By axis (x y z over the extent, direction) and view, in 1/10000. */
-  views: [Steps, Steps, Steps, Steps, Steps, Steps];
+  /** Focal length of the photos, pixels; a viewer's over it is its screen. */
+  focal: number;
+  /** Screens that promises are for, from and to; others count as the nearer end. */
+  screens: [number, number];
+  /** By axis (x y z over the extent, direction, log screen) and view, in 1/10000. */
+  views: [Steps, Steps, Steps, Steps, Steps, Steps, Steps];
   labels: LabelPromises[];
 }
 /** The viewpoint model of a label. */
@@ -172,14 +176,13 @@ export interface LabelPromises {
   confidence: number;
   /** Below it there is no bound. */
   leastSupport: number;
-  /** Of the mean where the support is 0; none at a known viewpoint. */
-  discount: number;
   targets: Steps;
   thresholds: Steps;
+  slopes: Steps;
   /** For an unknown distance. */
   medianLogDistance: number;
-  /** Length scales of position, direction, log distance. */
-  lengths: [number, number, number];
+  /** Length scales of position, direction, log screen, log distance. */
+  lengths: [number, number, number, number];
   /** By level; empty: 0. */
   curves: Curve[];
   /** By level. */

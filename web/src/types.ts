@@ -35,6 +35,8 @@ export interface Viewpoint {
   readonly direction: Vec3; // unit
   /** Six half spaces [nx, ny, nz, d] with n x + d >= 0 inside; empty: unlimited view. */
   readonly frustum: readonly (readonly [number, number, number, number])[];
+  /** Focal length of what is drawn, in its pixels; absent: that of the photos. */
+  readonly focal?: number;
 }
 
 export interface Budget {
@@ -89,12 +91,19 @@ export interface LabelState {
   readonly error: string | null;
   readonly visible: boolean; // in the frustum
   readonly distance: number; // NaN: unknown
-  readonly promised: number; // the promise: lower confidence bound of quality at the shown level; NaN: none
+  readonly promised: number; // the promise: lower confidence bound of quality of what is drawn; NaN: none
   readonly expected: number; // mean quality at the shown level
   readonly trust: Trust; // in the promise
   readonly count: number; // splats shown
   readonly bytes: number;
   readonly gpuBytes: number;
+}
+
+/** What promises are for: the viewer's focal length in pixels over the photos'. */
+export interface Screens {
+  readonly least: number;
+  readonly most: number; // a larger one is promised what its picture has, averaged down to this
+  readonly here: number; // of the present viewpoint
 }
 
 export interface State {
@@ -106,5 +115,6 @@ export interface State {
   readonly count: number; // shown
   readonly bandwidth: number; // bytes per second, measured; NaN: unknown
   readonly pending: number; // downloads
+  readonly screens: Screens | null; // that promises are for; null: not known yet
   readonly message: string | null; // for the user
 }

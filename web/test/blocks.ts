@@ -3,7 +3,7 @@
 import { rotate } from "../src/core/distance";
 import type { Box, Label, Level, Manifest, Promises, Viewpoint } from "../src/types";
 import { type Network, seeded } from "./simulate";
-import { differences, frustumOf, manifestOf, modelOf, PROMISES, qualityOf, store } from "./worlds";
+import { differences, FOCAL, frustumOf, manifestOf, modelOf, PROMISES, qualityOf, store } from "./worlds";
 
 const SIDE = 10; // of a block, world units
 
@@ -89,7 +89,7 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
   const all = Array.from({ length: side * side * views }, () => {
     const turn = 2 * Math.PI * random();
     const [x, z] = [SIDE * side * random(), SIDE * side * random()];
-    return [x, 1.5, z, Math.sin(turn), 0, Math.cos(turn)] as const;
+    return [x, 1.5, z, Math.sin(turn), 0, Math.cos(turn), 0] as const;
   });
   const extent = SIDE * side;
   const column = (axis: number) =>
@@ -97,7 +97,9 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
   return {
     quality: "fidelity",
     extent,
-    views: [column(0), column(1), column(2), column(3), column(4), column(5)],
+    focal: FOCAL,
+    screens: [0.5, 2],
+    views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6)],
     labels: labels.map((label) => {
       const [x = 0, , z = 0] = label.boxes[0] ?? [];
       const away = all.map((view) => Math.hypot(view[0] - x, view[2] - z));
@@ -106,7 +108,7 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
       return {
         ...modelOf(label, rows, random),
         medianLogDistance: 2,
-        lengths: [0.2, 0.7, 0.6] as const,
+        lengths: [0.2, 0.7, 0.8, 0.6] as const,
         logDistances: {
           unit: 0.01,
           steps: differences(rows.map((row) => 100 * Math.log(1 + (away[row] ?? 0)))),

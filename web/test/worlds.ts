@@ -18,6 +18,7 @@ import { fnv, type Network, seeded } from "./simulate";
 
 export const BASE = new URL("https://example.org/");
 export const PROMISES = "promises-1.json";
+export const FOCAL = 800; // px, of the photos
 export const NO_BUDGET = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
 export const DEFAULTS: Settings = {
   mode: "target",
@@ -200,11 +201,11 @@ export function modelOf(label: Label, rows: readonly number[], random: () => num
     status: "calibrated",
     confidence: 0.95,
     leastSupport: 0,
-    discount: 0,
     targets: [3000, 6000, 8000, 9000, 9900],
     thresholds: [3200, 6200, 8200, 9200, 9990],
+    slopes: [0, 0, 0, 0, 0],
     medianLogDistance: 1.6,
-    lengths: [0.5, 0.7, 0.6],
+    lengths: [0.5, 0.7, 0.8, 0.6],
     curves: [],
     offsets: means,
     views: differences(rows),
@@ -219,14 +220,16 @@ export function modelOf(label: Label, rows: readonly number[], random: () => num
 }
 
 function promisesOf(labels: readonly Label[], random: () => number): Promises {
-  const views = Array.from({ length: 12 }, () => [10 * random() - 5, 0, 4 * random(), 0, 0, -1]);
+  const views = Array.from({ length: 12 }, () => [10 * random() - 5, 0, 4 * random(), 0, 0, -1, 0]);
   const rows = views.map((_, i) => i);
   const column = (axis: number) =>
     differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1)));
   return {
     quality: "fidelity",
     extent: 5,
-    views: [column(0), column(1), column(2), column(3), column(4), column(5)],
+    focal: FOCAL,
+    screens: [0.5, 2],
+    views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6)],
     labels: labels.map((label) => ({
       ...modelOf(label, rows, random),
       shares: differences(rows.map(() => (10_000 * random()) / labels.length)),

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from sagesplat.adapt.allocate import best_within, cheapest
 from sagesplat.adapt.fill import fill
 from sagesplat.adapt.plan import Choice, Plan, Status, check_target
-from sagesplat.adapt.viewpoint import QualityKind, ViewModel
+from sagesplat.adapt.viewpoint import QualityKind, ViewModel, where
 from sagesplat.scene.scene import Camera
 
 Unit = Literal["bytes", "gpu-bytes", "count"]
@@ -62,14 +62,12 @@ def quality_at(
         mean and bound [V, L, K], NaN for categories without a model; distance [V, L].
     """
     shape = len(cameras), *costs.count.shape
-    position = np.stack([camera.position for camera in cameras])
-    direction = np.stack([camera.direction for camera in cameras])
     mean, bound, far = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
     calibrated = np.zeros(len(costs.labels), bool)
     for i, label in enumerate(costs.labels):
         far[:, i] = distances.get(label, far[:, i])
         if label in promises:
-            predicted = promises[label].predict(far[:, i], position, direction)
+            predicted = promises[label].predict(far[:, i], *where(cameras, promises[label].focal))
             known = np.array(promises[label].levels) - 1
             mean[:, i, known], bound[:, i, known] = predicted.mean, predicted.bound
             calibrated[i] = promises[label].status == "calibrated"

@@ -10,6 +10,9 @@ Views are the unit: those of one capture are drawn independently, the categories
 category has its own thresholds, and each target has its own. With fewer than 19 views (at 0.95) not even the
 largest is enough: "uncalibrated", widened to the largest of all categories.
 
+Away from viewpoints that are known a mean is less certain. So the threshold is the target and a margin that
+is proportional to `CERTAIN + 1 - support`; it is the margin that is calibrated.
+
 Quality depends on the neighbours' levels too. So compositions are measured: plans made for a range of nominal
 targets by preliminary thresholds. What is calibrated is the nominal target to ask for.
 """
@@ -18,6 +21,8 @@ import math
 
 import numpy as np
 from jaxtyping import Float, Int
+
+CERTAIN = 0.25  # of a known viewpoint's margin over that of one far from all
 
 
 def fewest_views(confidence: float) -> int:
@@ -31,16 +36,19 @@ def conformal_quantile(values: Float[np.ndarray, " n"], confidence: float) -> fl
     return float(np.sort(values)[rank - 1]) if rank <= len(values) else math.inf
 
 
-def critical_thresholds(
-    mean: Float[np.ndarray, "n K"], measured: Float[np.ndarray, "n K"], target: float
+def critical_margins(
+    mean: Float[np.ndarray, "n K"],
+    measured: Float[np.ndarray, "n K"],
+    target: float,
+    scale: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """In each view, the largest threshold by which a level is taken that misses the target; -inf: none.
+    """In each view, the largest margin by which a level is taken that misses the target; -inf: none.
 
-    A threshold takes the first level whose mean reaches it; above all means nothing is taken.
+    A margin takes the first level whose mean reaches target + margin * scale; above all means nothing is.
     """
     taken = np.diff(mean, axis=1, prepend=-np.inf) > 0  # of equal means the first
     missed = (measured < target) & taken
-    return np.where(missed, mean, -np.inf).max(1)
+    return np.where(missed, (mean - target) / scale[:, None], -np.inf).max(1)
 
 
 def critical_nominals(

@@ -122,8 +122,8 @@ def calibrate_photos(views: Mapping[int, LeftOut], confidence: float) -> dict[in
             num_views=heldout,
             targets=targets,
             thresholds=thresholds,
+            slopes=np.full(len(targets), scored[label].discount),
             least_support=float(np.clip(own.support.min(), 0, 1)),
-            discount=scored[label].discount,
         )
     return found
 

@@ -28,7 +28,8 @@ from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import ColumnTable, from_rows, read_columns
-from sagesplat.metrics.image import means_by_label, ssim_map
+from sagesplat.metrics.image import means_by_label, pasted, ssim_map
+from sagesplat.metrics.ms_ssim import ms_ssim
 from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
@@ -37,6 +38,7 @@ from sagesplat.segment.valid import ALL_VALID, ValidPixels
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)  # by the number in the table
 UNIFORM = -3  # label id of the whole image with all categories at one level
 COLOURS = ("plain_psnr", "cc_psnr", "cc_ssim")  # of `measure_colours`
+OF_WHOLE = (*COLOURS, "ms_ssim")  # columns that only whole images of plans have
 KEPT = 512 * 2**20  # bytes of the full model's images to keep; of further views they are rendered again
 
 
@@ -68,6 +70,8 @@ class Evaluation(ColumnTable):
     full_plain_psnr: Float32[np.ndarray, " R"]
     full_cc_psnr: Float32[np.ndarray, " R"]
     full_cc_ssim: Float32[np.ndarray, " R"]
+    ms_ssim: Float32[np.ndarray, " R"]  # of the same rows, against the photo, with its exposure
+    full_ms_ssim: Float32[np.ndarray, " R"]
 
     def of(self, plan: Plan) -> "Evaluation":
         """The rows of a plan: for its target, or within the budget."""
@@ -161,7 +165,8 @@ def evaluate(
             if view.camera.exposure is not None:
                 image = render(g, view.camera)
             measured = measure(image, photo, masks[view], inner[row], valid[view])
-            measured[TOTAL] |= colours
+            multi_scale = ms_ssim(image, pasted(photo, image, valid[view]), valid[view])
+            measured[TOTAL] |= {**colours, "ms_ssim": multi_scale}
             return row, measured, fidelity
 
         for found in each_view(in_view, views, device_of(backend)):
@@ -180,7 +185,7 @@ def evaluate(
                 "ssim": measured[TOTAL]["ssim"], "psnr": measured[TOTAL]["psnr"],
                 "num_pixels": measured[TOTAL]["num_pixels"],
                 "full_ssim": full[row][TOTAL]["ssim"], "full_psnr": full[row][TOTAL]["psnr"],
-                **_colours({}, {}),
+                **_of_whole({}, {}),
             })  # fmt: skip
     for plan in plans:
         for row, measured, fidelity in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
@@ -193,15 +198,15 @@ def evaluate(
                     "fidelity": fidelity.get(label, np.nan),
                     "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": full[row][label]["ssim"], "full_psnr": full[row][label]["psnr"],
-                    **_colours(values, full[row][label]),
+                    **_of_whole(values, full[row][label]),
                 })  # fmt: skip
     return from_rows(Evaluation, rows)
 
 
-def _colours(values: Mapping[str, float], full: Mapping[str, float]) -> dict[str, float]:
-    """Columns of plain and colour-corrected metrics; NaN where they were not measured."""
-    return {name: values.get(name, np.nan) for name in COLOURS} | {
-        f"full_{name}": full.get(name, np.nan) for name in COLOURS
+def _of_whole(values: Mapping[str, float], full: Mapping[str, float]) -> dict[str, float]:
+    """Columns of `OF_WHOLE`, of a plan and of the full model; NaN where they were not measured."""
+    return {name: values.get(name, np.nan) for name in OF_WHOLE} | {
+        f"full_{name}": full.get(name, np.nan) for name in OF_WHOLE
     }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
-from sagesplat.adapt.observe import MIN_SHARE, PERCENTILE, RenderedLabels, distances_in_views, render_rgb
+from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
 from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
 from sagesplat.io.files import atomic_path
@@ -23,6 +23,7 @@ from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera, Scene, View
 
 _KEEP = 10**9  # bytes of references that are kept
+PROMISED_SHARE = 2e-3  # of a picture that a category has to cover: of fewer pixels nothing is promised
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +38,14 @@ class SampledFidelity:
     distance: Float32[np.ndarray, "V L"]  # d_min, world units; NaN: unknown
 
     def shown(self) -> np.ndarray:
-        """Whether a category covers at least `MIN_SHARE` of the image, bool [V, L]."""
-        return (self.pixels > 0) & (self.pixels >= MIN_SHARE * self.image[:, None])
+        """Whether a category covers at least `PROMISED_SHARE` of the image, bool [V, L]."""
+        return (self.pixels > 0) & (self.pixels >= PROMISED_SHARE * self.image[:, None])
 
 
 def shown_enough(pixels: Int[np.ndarray, "V L"], cameras: Sequence[Camera]) -> Bool[np.ndarray, "V L"]:
-    """Whether a category covers at least `MIN_SHARE` of the image at each viewpoint."""
+    """Whether a category covers at least `PROMISED_SHARE` of the image at each viewpoint."""
     image = np.array([camera.width * camera.height for camera in cameras])
-    return (pixels > 0) & (pixels >= MIN_SHARE * image[:, None])
+    return (pixels > 0) & (pixels >= PROMISED_SHARE * image[:, None])
 
 
 def measure_levels(

@@ -10,7 +10,7 @@ Three sets of drawn viewpoints are used, each for one thing:
    at the nominal target that keeps it (`hold_all_categories`).
 3. "calibration": split conformal prediction says which nominal target to ask for, so that each target is kept
    at the confidence, category by category (`adapt.calibrate`). Neighbours' levels move with that, so it is
-   done twice; the second time thresholds only rise.
+   done twice.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,18 +20,27 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from sagesplat.adapt.calibrate import (
+    CERTAIN,
     conformal_quantile,
+    critical_margins,
     critical_nominals,
-    critical_thresholds,
     fewest_views,
 )
 from sagesplat.adapt.fidelity import SampledFidelity
-from sagesplat.adapt.process import fit_process, inputs_of, matern32
-from sagesplat.adapt.viewpoint import Calibration, Status, ViewModel, constant_curve, monotone
+from sagesplat.adapt.process import fit_process, matern32
+from sagesplat.adapt.viewpoint import (
+    NO_CALIBRATION,
+    Calibration,
+    Status,
+    ViewModel,
+    constant_curve,
+    monotone,
+    where,
+)
 from sagesplat.scene.scene import Camera
 
 # Targets that compositions are planned for.
-NOMINAL = np.array([0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 0.925, 0.95, 0.965, 0.98, 0.99])
+NOMINAL = np.array([0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98, 0.99])
 # Targets that are calibrated; those between them are interpolated.
 TARGETS = np.unique(
     np.concatenate(
@@ -39,9 +48,8 @@ TARGETS = np.unique(
     ).round(4)
 )
 NOTHING_HELD = np.zeros(len(TARGETS), bool)
-EVERYTHING_HELD = ~NOTHING_HELD
 _ABOVE = 1e-9  # a threshold lies above its critical value
-_TIE_EPSILON = 1e-6  # between equal thresholds
+_MARGINS = (-1.0, 10.0)  # limits of preliminary ones
 _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more than chance
 
 
@@ -50,6 +58,8 @@ def fit_fidelity(
     cameras: Sequence[Camera],
     extent: float,
     confidence: float,
+    focal: float,
+    screens: tuple[float, float],
 ) -> dict[int, ViewModel]:
     """Fit the expected fidelity of each category over the viewpoint, with preliminary thresholds.
 
@@ -58,11 +68,12 @@ def fit_fidelity(
         cameras: The V viewpoints.
         extent: Of the scene, world units.
         confidence: Of the preliminary thresholds.
+        focal: Of the photos, pixels.
+        screens: Of the viewpoints (`ViewModel`).
 
     Returns:
         Models by label id; a category that is shown in no viewpoint has none. They are not calibrated yet.
     """
-    position, direction = _poses(cameras)
     shown, models = sampled.shown(), {}
     for column, label in enumerate(sampled.labels):
         rows = np.flatnonzero(shown[:, column])
@@ -72,65 +83,66 @@ def fit_fidelity(
         distance = sampled.distance[rows, column].astype(np.float64)
         known = np.log(distance[distance > 0])
         median = float(np.median(known)) if len(known) else 0.0
-        x = inputs_of(distance, position[rows], direction[rows], extent, median)
-        models[label] = _fit(label, x, values, extent, median, confidence)
+        unfitted = ViewModel(
+            label_id=label, quality="fidelity", curves=(), extent=extent, median_log_distance=median,
+            focal=focal, screens=screens, inputs=np.zeros((0, 8)), heldout_inputs=np.zeros(len(rows), bool),
+            lengths=(1.0, 1.0, 1.0, 1.0), heldout_variance=0.0, weights=np.zeros(values.shape), rmse=0.0,
+            calibration=NO_CALIBRATION,
+        )  # fmt: skip
+        x = unfitted.inputs_at(distance, *where([cameras[row] for row in rows], focal))
+        models[label] = _fit(unfitted, x, values, confidence)
     return models
 
 
 def _fit(
-    label: int,
-    x: Float[np.ndarray, "n 7"],
-    values: Float[np.ndarray, "n K"],
-    extent: float,
-    median: float,
-    confidence: float,
+    unfitted: ViewModel, x: Float[np.ndarray, "n 8"], values: Float[np.ndarray, "n K"], confidence: float
 ) -> ViewModel:
     mean = values.mean(0)
-    photos = np.zeros(len(x), bool)
     # the last level is the reference: known, and no part of the process (unless it is the only one)
     learnt = slice(0, max(len(mean) - 1, 1))
-    process = fit_process(x, photos, (values - mean)[:, learnt])
+    process = fit_process(x, unfitted.heldout_inputs, (values - mean)[:, learnt])
     weights = np.zeros(values.shape)
     weights[:, learnt] = process.weights
     left_out = values.copy()
     left_out[:, learnt] = mean[learnt] + process.left_out
     left_out = monotone(left_out)
     rmse = np.sqrt(((left_out - values) ** 2).mean(0))
-    levels = range(1, len(mean) + 1)
-    thresholds = [
-        np.quantile(critical_thresholds(left_out, values, target), confidence, method="higher")
-        for target in TARGETS
-    ]
-    return ViewModel(
-        label_id=label,
-        quality="fidelity",
+    near = matern32(x, x, process.lengths)
+    np.fill_diagonal(near, 0)
+    least = float(near.max(1).min())  # each by the others
+    scale = CERTAIN + 1 - near.max(1)
+    margins = np.clip(
+        [
+            np.quantile(critical_margins(left_out, values, target, scale), confidence, method="higher")
+            for target in TARGETS
+        ],
+        *_MARGINS,
+    )
+    return replace(
+        unfitted,
         curves=tuple(
-            constant_curve(label, k, float(m), float(e), len(x))
-            for k, m, e in zip(levels, mean, rmse, strict=True)
+            constant_curve(unfitted.label_id, k, float(m), float(e), len(x))
+            for k, m, e in zip(range(1, len(mean) + 1), mean, rmse, strict=True)
         ),
-        extent=extent,
-        median_log_distance=median,
         inputs=x,
-        heldout_inputs=photos,
         lengths=process.lengths,
-        heldout_variance=0.0,
         weights=weights,
         rmse=float(rmse.mean()),
-        calibration=_calibration(np.array(thresholds), "uncalibrated", confidence, 0, 0.0),
+        calibration=_calibration(TARGETS + CERTAIN * margins, margins, "uncalibrated", confidence, 0, least),
     )
 
 
 def _calibration(
-    thresholds: Float[np.ndarray, " G"], status: Status, confidence: float, views: int, least: float
+    thresholds: Float[np.ndarray, " G"],
+    slopes: Float[np.ndarray, " G"],
+    status: Status,
+    confidence: float,
+    views: int,
+    least: float,
 ) -> Calibration:
     """A calibration from the thresholds of TARGETS; the full model (mean 1) keeps all targets."""
-    targets = np.append(TARGETS, 1.0)
-    up = np.append(np.clip(thresholds + _ABOVE, -1, 1), 1.0)
-    # Equal thresholds stay apart by a hair: below the first of them not even its target is reached.
-    ties = _TIE_EPSILON * np.arange(len(up))
-    up = np.maximum.accumulate(up - ties) + ties
-    up = np.minimum.accumulate((np.minimum(up, 1.0) - ties)[::-1])[::-1] + ties
-    return Calibration(status, confidence, views, targets, up, least)
+    targets, thresholds = np.append(TARGETS, 1.0), np.append(np.clip(thresholds + _ABOVE, -1, 1), 1.0)
+    return Calibration(status, confidence, views, targets, thresholds, np.append(slopes, 0.0), least)
 
 
 def plan_nominal(
@@ -182,9 +194,8 @@ class Trial:
     def least_support(self, model: ViewModel) -> float:
         """The least support of any of these viewpoints: further away nothing was tried."""
         column, rows = list(self.labels).index(model.label_id), self.views(model.label_id)
-        position, direction = _poses([self.cameras[row] for row in rows])
         distance = self.distance[rows, column].astype(np.float64)
-        x = inputs_of(distance, position, direction, model.extent, model.median_log_distance)
+        x = model.inputs_at(distance, *where([self.cameras[row] for row in rows], model.focal))
         return float(matern32(x, model.inputs, model.lengths).max(1).min())
 
 
@@ -267,7 +278,8 @@ def calibrated(
             nominal = np.maximum(widest, trial.critical(model).max(1)) if views else widest
         made = _asked(model, nominal)
         status = "calibrated" if label in asked else "uncalibrated"
-        least = trial.least_support(model) if views else 0.0
+        least = model.calibration.least_support
+        least = min(least, trial.least_support(model)) if views else least
         calibration = replace(
             made.calibration, status=status, confidence=confidence, num_views=views, least_support=least
         )
@@ -281,7 +293,10 @@ def _asked(model: ViewModel, nominal: Float[np.ndarray, " G"]) -> ViewModel:
     low = nominal - (now.targets[0] - now.thresholds[0])  # below the first target, as `Calibration.bound`
     known = np.interp(nominal, now.targets, now.thresholds)
     thresholds = np.where(nominal < now.targets[0], low, known)
-    calibration = _calibration(thresholds, now.status, now.confidence, now.num_views, now.least_support)
+    slopes = np.interp(nominal, now.targets, now.slopes)
+    calibration = _calibration(
+        thresholds, slopes, now.status, now.confidence, now.num_views, now.least_support
+    )
     return replace(model, calibration=calibration)
 
 
@@ -289,10 +304,5 @@ def _bounds(
     model: ViewModel, distance: Float32[np.ndarray, " V"], cameras: Sequence[Camera]
 ) -> Float[np.ndarray, "V K"]:
     """The model's bounds at viewpoints; -1 where it gives none."""
-    return np.nan_to_num(model.predict(distance.astype(np.float64), *_poses(cameras)).bound, nan=-1.0)
-
-
-def _poses(cameras: Sequence[Camera]) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"]]:
-    """Positions and directions."""
-    poses = np.array([(camera.position, camera.direction) for camera in cameras], np.float64)
-    return poses.reshape(-1, 2, 3)[:, 0], poses.reshape(-1, 2, 3)[:, 1]
+    at = where(cameras, model.focal)
+    return np.nan_to_num(model.predict(distance.astype(np.float64), *at).bound, nan=-1.0)

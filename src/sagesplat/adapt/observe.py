@@ -1,5 +1,6 @@
 """Observations: the quality of each category at each level, view by view."""
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
 from sagesplat.adapt.seen import seen_from
+from sagesplat.adapt.viewpoints import LONGEST
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import ColumnTable, from_rows, read_columns
@@ -91,16 +93,20 @@ def distances_in_views(
 
 
 def widest_lens(cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Largest half width and half height of the cameras' pictures, at distance 1."""
-    sizes = np.array([[c.width / c.K[0, 0], c.height / c.K[1, 1]] for c in cameras], np.float64) / 2
-    wide, high = sizes.max(0).tolist()
+    """Largest half width and half height, at distance 1, of the pictures that models know.
+
+    Those are the cameras' own, and the ones of other shapes and the same area that `adapt.viewpoints` draws.
+    """
+    own = np.array([[c.width / c.K[0, 0], c.height / c.K[1, 1]] for c in cameras], np.float64)
+    shaped = max(math.sqrt(c.width * c.height * LONGEST) / c.focal for c in cameras)
+    wide, high = (np.maximum(own.max(0), shaped) / 2).tolist()
     return wide, high
 
 
 def within_lens(camera: Camera, lens: tuple[float, float]) -> Camera:
     """The camera with a picture no wider and no higher than `lens`, around its principal point; else itself.
 
-    Models know distances in photos: the closest points in a wider picture are ones that no photo has.
+    Models know distances in such pictures: the closest points in a wider one are ones that none of them has.
     """
     focal, size = camera.K.diagonal()[:2].astype(np.float64), np.array([camera.width, camera.height])
     most = np.maximum(np.round(2 * focal * lens), 1).astype(int)

@@ -17,7 +17,7 @@ from sagesplat.adapt.calibrate_photos import LeftOut, calibrate_photos, with_cha
 from sagesplat.adapt.eq3 import SsimModel, fit_models
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.process import fit_process, inputs_of, matern32
-from sagesplat.adapt.viewpoint import ViewModel, means_at, monotone
+from sagesplat.adapt.viewpoint import PHOTOS_ONLY, ViewModel, means_at, monotone
 from sagesplat.scene.scene import Scene
 
 
@@ -151,6 +151,8 @@ def _fit(rows: Observations, scene: Scene, curves: tuple[SsimModel, ...]) -> Pho
         curves=curves,
         extent=extent,
         median_log_distance=median_log_distance,
+        focal=float(np.median([view.camera.focal for view in scene.views])),
+        screens=PHOTOS_ONLY,
         inputs=x,
         heldout_inputs=heldout,
         lengths=process.lengths,

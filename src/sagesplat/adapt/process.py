@@ -2,7 +2,8 @@
 
 One kernel serves all levels, only its amplitude differs:
 
-    x        = (position / extent, direction, log distance): 7 numbers, 3 groups with a length scale each
+    x        = (position / extent, direction, log screen, log distance): 8 numbers, 4 groups with a length
+               scale each; screen: the viewer's focal length in pixels over the photos'
     a(x, x') = sqrt(3 * sum over the groups of |x - x'|^2 / length^2)
     c(x, x') = (1 + a) exp(-a)                                        Matern 3/2
     S_ij     = c(x_i, x_j) + heldout_variance * u_i * u_j + noise * [i = j]
@@ -24,11 +25,12 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of the inputs: position, direction, log distance
+# of the inputs: position, direction, log screen, log distance
+GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 8))
 # logs of the hyperparameters (lengths of GROUPS; heldout variance and noise over the amplitude's square):
 # where they are sought, one standard deviation of the prior, and the bounds in standard deviations
-PRIOR = np.log([0.3, 0.5, 0.5, 0.1, 0.1])
-PRIOR_WIDTH = np.array([0.7, 0.7, 0.7, 1.5, 1.5])
+PRIOR = np.log([0.3, 0.5, 1.0, 0.5, 0.1, 0.1])
+PRIOR_WIDTH = np.array([0.7, 0.7, 0.7, 0.7, 1.5, 1.5])
 PRIOR_REACH = 3.0
 FEW = 0.1  # what values are uncertain by if seen in one view; falls as 1 / views
 
@@ -37,7 +39,7 @@ FEW = 0.1  # what values are uncertain by if seen in one view; falls as 1 / view
 class Process:
     """A fitted process, and its views predicted without themselves."""
 
-    lengths: tuple[float, float, float]  # of the three groups of inputs
+    lengths: tuple[float, float, float, float]  # of GROUPS
     heldout_variance: float  # variances over that of the process
     noise: float
     weights: Float[np.ndarray, "n K"]
@@ -50,15 +52,17 @@ def inputs_of(
     direction: Float[np.ndarray, "V 3"],
     extent: float,
     median_log_distance: float,
-) -> Float[np.ndarray, "V 7"]:
-    """The inputs x of viewpoints; an unknown distance (NaN) counts as the median."""
+    screen: Float[np.ndarray, " V"] | None = None,
+) -> Float[np.ndarray, "V 8"]:
+    """The inputs x of viewpoints; unknown distances (NaN) count as the median, no screen as the photos'."""
     known = np.isfinite(distance) & (distance > 0)
     log_distance = np.where(known, np.log(np.where(known, distance, 1.0)), median_log_distance)
-    return np.column_stack([position / extent, direction, log_distance]).astype(np.float64)
+    log_screen = np.zeros(len(distance)) if screen is None else np.log(screen)
+    return np.column_stack([position / extent, direction, log_screen, log_distance]).astype(np.float64)
 
 
 def matern32(
-    a: Float[np.ndarray, "A 7"], b: Float[np.ndarray, "B 7"], lengths: Sequence[float]
+    a: Float[np.ndarray, "A 8"], b: Float[np.ndarray, "B 8"], lengths: Sequence[float]
 ) -> Float[np.ndarray, "A B"]:
     """c(x, x') of the module's text, for all pairs of inputs."""
     scale = np.repeat(lengths, [group.stop - group.start for group in GROUPS])
@@ -67,12 +71,12 @@ def matern32(
 
 
 def fit_process(
-    x: Float[np.ndarray, "n 7"], heldout: Bool[np.ndarray, " n"], values: Float[np.ndarray, "n K"]
+    x: Float[np.ndarray, "n 8"], heldout: Bool[np.ndarray, " n"], values: Float[np.ndarray, "n K"]
 ) -> Process:
     """Fit a process of zero mean to values at n >= 1 viewpoints and K levels.
 
     Args:
-        x: [n, 7], inputs (`inputs_of`).
+        x: [n, 8], inputs (`inputs_of`).
         heldout: [n], whether training never saw the view.
         values: [n, K], what the levels' means leave.
 
@@ -84,9 +88,9 @@ def fit_process(
     inverse, _ = _inverse(_terms(squares, heldout, theta)[0])
     weights = inverse @ values
     own = np.diag(inverse)[:, None]
-    x_length, direction_length, distance_length, heldout_variance, noise = np.exp(theta).tolist()
+    position, direction, screen, distance, heldout_variance, noise = np.exp(theta).tolist()
     return Process(
-        lengths=(x_length, direction_length, distance_length),
+        lengths=(position, direction, screen, distance),
         heldout_variance=heldout_variance,
         noise=noise,
         weights=weights,

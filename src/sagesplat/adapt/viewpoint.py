@@ -9,13 +9,18 @@ evaluates the same formulas (`web/src/core/quality.ts`):
               made monotone over the levels: half of (the largest up to k + the smallest from k on), kept in
               [-1, 1]
     support = max_i c(x, x_i)                       1 at a known viewpoint, 0 far from all
-    bound_k = the largest target whose threshold mean_k - discount * (1 - support) reaches
+    bound_k = the largest target whose threshold, at this support, mean_k reaches
+              threshold = threshold_target + slope_target * (1 - support), at least those of lower targets,
+              at most 1
 
 `adapt.calibrate` finds, for each target, the threshold: the mean from which on a level keeps the target, at a
-confidence. Between targets it is interpolated. The discount is for errors that grow away from known
-viewpoints (fidelity: 0). Where the support is below that of all calibration views there is no bound (NaN):
-nothing is known there. An unknown distance (NaN) counts as `median_log_distance` in x, and m_k is then the
-median.
+confidence. Between targets it is interpolated. The slopes are for errors that grow away from known
+viewpoints. Where the support is below that of all calibration views there is no bound (NaN): nothing is known
+there. An unknown distance (NaN) counts as `median_log_distance` in x, and m_k is then the median.
+
+A viewpoint's screen is its focal length in pixels over that of the photos. Fidelity is known for those in
+`screens`; smaller ones are promised what the smallest has, and on larger ones the picture is meant averaged
+down to the largest. SSIM against photos is known in the photos' pixels alone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,6 +37,7 @@ from sagesplat.adapt.process import inputs_of, matern32
 from sagesplat.core.limits import LARGEST, Count, LabelId, NotNegative, Number, Positive, Share
 from sagesplat.io.files import write_json
 from sagesplat.io.typed import read_json_as, refused, to_plain
+from sagesplat.scene.scene import Camera
 
 QualityKind = Literal["fidelity", "ssim"]  # against the full model, or against photos
 Status = Literal[
@@ -57,9 +63,9 @@ class Calibration:
     confidence: Annotated[float, Meta(gt=0, lt=1)]  # share of decisions that hold
     num_views: Count  # calibration views that show the category
     targets: Float[np.ndarray, " G"]  # ascending
-    thresholds: Float[np.ndarray, " G"]  # ascending: the mean from which on a level keeps the target
+    thresholds: Float[np.ndarray, " G"]  # the mean from which on a level keeps the target, at support 1
+    slopes: Float[np.ndarray, " G"]  # by which that rises to where the support is 0
     least_support: Share  # below it there is no bound
-    discount: NotNegative = 0.0  # of the mean where the support is 0; none at a known viewpoint
 
     def bound(
         self, mean: Float[np.ndarray, "V K"], support: Float[np.ndarray, " V"]
@@ -70,15 +76,18 @@ class Calibration:
         """
         if not len(self.targets):
             return np.full(mean.shape, np.nan)
-        mean = mean - self.discount * (1 - support)[:, None]
-        found = np.interp(mean, self.thresholds, self.targets)
-        low = mean < self.thresholds[0]
-        found[low] = mean[low] + (self.targets[0] - self.thresholds[0])
+        needed = np.minimum(np.maximum.accumulate(self.thresholds + np.outer(1 - support, self.slopes), 1), 1)
+        found = np.array(
+            [np.interp(m, n, self.targets) for m, n in zip(mean, needed, strict=True)], np.float64
+        ).reshape(mean.shape)
+        low = mean < needed[:, :1]
+        found = np.where(low, mean + (self.targets[0] - needed[:, :1]), found)
         found[support < self.least_support] = np.nan
         return found
 
 
-NO_CALIBRATION = Calibration("uncalibrated", 0.95, 0, np.zeros(0), np.zeros(0), 0.0)
+NO_CALIBRATION = Calibration("uncalibrated", 0.95, 0, np.zeros(0), np.zeros(0), np.zeros(0), 0.0)
+PHOTOS_ONLY = (1.0, 1.0)  # screens of a model that knows the photos' pixels alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +99,11 @@ class ViewModel:
     curves: tuple[SsimModel, ...]  # of each level, ascending: Eq. 3, or a constant (`constant_curve`)
     extent: Positive  # of the scene, world units
     median_log_distance: Number  # log distance, for viewpoints that know none
-    inputs: Float[np.ndarray, "n 7"]  # of the views behind it: position / extent, direction, log d
+    focal: Positive  # of the photos, pixels: what screens are measured by
+    screens: tuple[Positive, Positive]  # from and to; what lies outside counts as the end of it
+    inputs: Float[np.ndarray, "n 8"]  # of the views behind it: position / extent, direction, log s, log d
     heldout_inputs: Bool[np.ndarray, " n"]  # photos that training never saw; of fidelity none
-    lengths: tuple[Positive, Positive, Positive]  # of the three groups of inputs
+    lengths: tuple[Positive, Positive, Positive, Positive]  # of the groups of inputs
     heldout_variance: NotNegative  # over the variance of the process
     weights: Float[np.ndarray, "n K"]
     rmse: Number  # of its views, each predicted without itself; over all levels
@@ -123,6 +134,7 @@ class ViewModel:
         distance: Float[np.ndarray, " V"],
         position: Float[np.ndarray, "V 3"],
         direction: Float[np.ndarray, "V 3"],
+        screen: Float[np.ndarray, " V"] | None = None,
     ) -> Prediction:
         """Predict the quality of each level at V viewpoints, whether a photo was taken there or not.
 
@@ -130,6 +142,7 @@ class ViewModel:
             distance: [V], d_min to the category in world units; NaN: unknown.
             position: [V, 3], camera centres in world units.
             direction: [V, 3], unit viewing directions (the camera's z) in the world.
+            screen: [V], focal length in pixels over `focal`; None: 1.
 
         Returns:
             mean and bound [V, K], each column a level; support [V]: 1 at a known viewpoint, 0 far from all.
@@ -143,12 +156,38 @@ class ViewModel:
             >>> camera, model = run.scene.views[0].camera, run.fidelity[184]  # doctest: +SKIP
             >>> model.predict(near, camera.position[None], camera.direction[None]).bound  # doctest: +SKIP
         """
-        x = inputs_of(distance, position, direction, self.extent, self.median_log_distance)
+        x = self.inputs_at(distance, position, direction, screen)
         near = matern32(x, self.inputs, self.lengths)
         k = near + self.heldout_variance * self.heldout_inputs
         mean = monotone(means_at(self.curves, distance) + k @ self.weights)
         support = near.max(1)
         return Prediction(mean, self.calibration.bound(mean, support), support)
+
+    def inputs_at(
+        self,
+        distance: Float[np.ndarray, " V"],
+        position: Float[np.ndarray, "V 3"],
+        direction: Float[np.ndarray, "V 3"],
+        screen: Float[np.ndarray, " V"] | None = None,
+    ) -> Float[np.ndarray, "V 8"]:
+        """The inputs of viewpoints, as of `predict`."""
+        screen = None if screen is None else np.clip(screen, *self.screens)
+        return inputs_of(distance, position, direction, self.extent, self.median_log_distance, screen)
+
+
+class Where(NamedTuple):
+    """Where V cameras are, as `ViewModel.predict` takes it after the distance."""
+
+    position: Float[np.ndarray, "V 3"]  # world
+    direction: Float[np.ndarray, "V 3"]
+    screen: Float[np.ndarray, " V"]
+
+
+def where(cameras: Sequence[Camera], focal: float) -> Where:
+    """Of cameras, by the photos' focal length in pixels."""
+    position = np.array([camera.position for camera in cameras], np.float64).reshape(-1, 3)
+    direction = np.array([camera.direction for camera in cameras], np.float64).reshape(-1, 3)
+    return Where(position, direction, np.array([camera.focal for camera in cameras], np.float64) / focal)
 
 
 def monotone(mean: Float[np.ndarray, "V K"]) -> Float[np.ndarray, "V K"]:
@@ -195,10 +234,14 @@ def _check(model: ViewModel) -> None:
     shapes = (len(model.inputs), *model.weights.shape)
     if not n or not model.curves or shapes != (n, n, len(model.curves)):
         raise ValueError("lists of unequal length")
-    if calibration.targets.shape != calibration.thresholds.shape:
+    targets, thresholds, slopes = calibration.targets, calibration.thresholds, calibration.slopes
+    if not targets.shape == thresholds.shape == slopes.shape:
         raise ValueError("lists of unequal length")
-    for rising in (calibration.targets, calibration.thresholds):
-        if not (np.diff(rising) > 0).all() or not (np.abs(rising) <= 1).all():
-            raise ValueError("targets or thresholds out of range")
-    if not all((np.abs(array) < LARGEST).all() for array in (model.inputs, model.weights)):
+    if not (np.diff(targets) > 0).all() or not (np.abs(targets) <= 1).all():
+        raise ValueError("targets out of range")
+    if not model.screens[0] <= model.screens[1]:
+        raise ValueError("screens out of order")
+    if not all(
+        (np.abs(array) < LARGEST).all() for array in (model.inputs, model.weights, thresholds, slopes)
+    ):
         raise ValueError("numbers out of range")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from sagesplat.core.limits import NotNegative, Seed, Share, SomeShare
+from sagesplat.core.limits import NotNegative, Screen, Seed, Share, SomeShare
 
 _MOST = 2**31 - 1
 Int31 = Annotated[int, Meta(ge=0, le=_MOST)]  # steps, views, pixels
@@ -255,12 +255,12 @@ class SampleConfig:
     viewpoints: Path | None = None
     """File with the cameras to draw from: a viewpoints.json, or a transforms.json (default: the cameras of
     the training and calibration photos)."""
-    neighbours: Int31 = 4
-    """Each viewpoint lies between a camera and one of this many nearest ones; 0: at a camera."""
     shift: Share = 0.03
-    """Largest random shift along each axis, as a fraction of the scene extent."""
-    turn: Annotated[float, Meta(ge=0, le=3.1416)] = 0.05
-    """Largest random rotation about each axis, radians."""
+    """Largest random shift from the capture's path along each axis, as a fraction of the scene extent."""
+    screens: tuple[Screen, Screen] = (0.5, 2.0)
+    """Screens that promises are for, from and to: the viewer's focal length in pixels over the photos'."""
+    places: tuple[Share, Share, Share] = (0.4, 0.4, 0.2)
+    """Shares of the viewpoints: on the capture's path, walking among its cameras, stepping back from them."""
 
 
 @dataclass(frozen=True)

@@ -62,11 +62,20 @@ def ssim_map(
         >>> bool(np.allclose(ssim_map(photo, photo), 1, atol=1e-5)), ssim_map(photo, 1 - photo).shape
         (True, (32, 48))
     """
+    return ssim_planes(x, y, tile_mask).mean(0)
+
+
+def ssim_planes(
+    x: Float32[np.ndarray, "H W 3"],
+    y: Float32[np.ndarray, "H W 3"],
+    tile_mask: Bool[np.ndarray, "h w"] | None = None,
+) -> Float32[np.ndarray, "3 H W"]:
+    """`ssim_map` of each channel."""
     space, width = Workspace(), x.shape[1]
     one, other = (to_planes(torch.from_numpy(i), space, name) for i, name in ((x, "x"), (y, "y")))
     values = np.empty_like(one)
     _maps(one, other, width, tile_mask, space, values)
-    return values[..., :width].mean(0)
+    return values[..., :width]
 
 
 def tiles_around(shown: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:

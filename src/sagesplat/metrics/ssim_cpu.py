@@ -20,7 +20,8 @@ _PATCH = _ROWS * _LINE  # floats of a plane that the blurs of a chunk take
 _F = np.float32
 _C1, _C2, _ONE, _TWO, _ZERO = _F(0.01**2), _F(0.03**2), _F(1), _F(2), _F(0)
 _taps = np.exp(-((np.arange(WINDOW) - RADIUS) ** 2) / (2 * 1.5**2))
-_K0, _K1, _K2, _K3, _K4, _K5 = (_F(t) for t in (_taps / _taps.sum())[: RADIUS + 1])
+TAPS = _taps / _taps.sum()  # weights of the window, along a line
+_K0, _K1, _K2, _K3, _K4, _K5 = (_F(t) for t in TAPS[: RADIUS + 1])
 _COLUMNS = np.arange(LANES, dtype=np.float32)
 
 

@@ -22,12 +22,13 @@ Facts = Sequence[tuple[str, str]]
 
 @dataclass(frozen=True)
 class PromiseFacts:
-    """What lower bounds of fidelity were made from."""
+    """What promises of fidelity were made from."""
 
     confidence: float
     fitted: int  # drawn viewpoints that the models were fitted to
     composed: int  # further ones, at which plans were composed and measured
-    calibration: int  # further ones, at which the bounds were calibrated
+    calibration: int  # further ones, at which they were calibrated
+    conditions: str  # what screens and places they are for, in words
 
 
 @dataclass(frozen=True, eq=False)

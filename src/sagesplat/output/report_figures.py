@@ -47,9 +47,9 @@ def report_figures(
             ),
         )
         yield (
-            "promised_and_measured",
+            "asked_and_measured",
             f"Promised and measured {quality_title(quality)} on unseen views",
-            figures.promised_and_measured(promises, labels, names, colours, quality),
+            figures.asked_and_measured(promises, labels, names, colours, quality),
         )
     if len(seen):
         yield (

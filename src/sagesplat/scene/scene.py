@@ -35,6 +35,11 @@ class Camera:
         return -self.w2c[:3, :3].T @ self.w2c[:3, 3]
 
     @property
+    def focal(self) -> float:
+        """Focal length in pixels, the geometric mean of both axes'."""
+        return float(np.sqrt(abs(float(self.K[0, 0]) * float(self.K[1, 1]))))
+
+    @property
     def direction(self) -> Float32[np.ndarray, "3"]:
         """Unit viewing direction (camera z) in the world."""
         return self.w2c[2, :3]

@@ -41,7 +41,7 @@ def evaluate_plans(job: Job) -> None:
 
     fitted = [run.provenance("observe"), run.provenance("fit")]
     inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
-    run_stage(job, "evaluate", {"colours": True}, inputs, [run.evaluation], make)
+    run_stage(job, "evaluate", {"colours": True, "ms_ssim": True}, inputs, [run.evaluation], make)
 
 
 def _levels_beside(job: Job, plans: Sequence[Plan]) -> list[int]:

@@ -6,7 +6,6 @@ import numpy as np
 
 from sagesplat.adapt.fidelity import distances_at, measure_compositions, shown_enough
 from sagesplat.adapt.fidelity_models import (
-    EVERYTHING_HELD,
     NOMINAL,
     Trial,
     calibrated,
@@ -36,15 +35,13 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
         Compositions(job, [drawn.cameras[row] for row in drawn.rows(name)])
         for name in ("bias", "calibration")
     )
-    models = fit_fidelity(sampled, fit, job.scene.scale, confidence)
+    models = fit_fidelity(sampled, fit, job.scene.scale, confidence, drawn.focal, drawn.rule.screens)
     models.pop(UNLABELLED, None)  # has no target and stays in full
     for _ in range(_ROUNDS):
         models = remove_composition_bias(models, trial(job, config, models, sampled.labels, bias), confidence)
     models, held = hold_all_categories(models, trial(job, config, models, sampled.labels, bias), confidence)
-    for lowered in (held, EVERYTHING_HELD):  # what calibration moved moves the neighbours: then only up
-        models = calibrated(
-            models, trial(job, config, models, sampled.labels, calibration), confidence, lowered
-        )
+    for _ in range(_ROUNDS):  # what calibration moved moves the neighbours
+        models = calibrated(models, trial(job, config, models, sampled.labels, calibration), confidence, held)
     return models
 
 

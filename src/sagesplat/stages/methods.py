@@ -15,6 +15,7 @@ from sagesplat.adapt.observe import LabelImages, Observations, RenderedLabels
 from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel, write_promises
+from sagesplat.adapt.viewpoints import in_words
 from sagesplat.core.config import FitConfig, LadderKind, PlanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import INDEX, totals
@@ -141,7 +142,7 @@ class NestedLevels(Method):
             if not statuses:
                 continue  # without photos no SSIM against them
             lines.append(f"{name}: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))
-        return lines
+        return [*lines, f"for {in_words(viewpoints_of(self.job))}"]
 
     def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
         """See `Method`."""

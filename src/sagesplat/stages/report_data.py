@@ -16,7 +16,7 @@ from sagesplat.adapt.free_poses import level_axes
 from sagesplat.adapt.ladder import PrefixLadder
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.adapt.viewpoint import QualityKind
-from sagesplat.adapt.viewpoints import SETS
+from sagesplat.adapt.viewpoints import SETS, in_words
 from sagesplat.core.config import LadderKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.pictures import open_picture
@@ -197,7 +197,8 @@ def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
         return None, {}
     models, sets, sampled = fidelity_of(job), viewpoints_of(job), sampled_of(job)
     confidence = min((model.confidence for model in models.values()), default=0.0)
-    facts = PromiseFacts(confidence, *(len(sets.rows(name)) for name in SETS))
+    fitted, composed, calibration = (len(sets.rows(name)) for name in SETS)
+    facts = PromiseFacts(confidence, fitted, composed, calibration, in_words(sets))
     shown = sampled.shown()
     drawn = {label: sampled.fidelity[shown[:, column], column] for column, label in enumerate(sampled.labels)}
     return facts, {label: values for label, values in drawn.items() if len(values)}

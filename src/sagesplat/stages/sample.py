@@ -1,5 +1,6 @@
 """Makes the samples of fidelity: every level at drawn viewpoints, measured against the full model."""
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 
@@ -11,6 +12,7 @@ from sagesplat.adapt.viewpoints import (
     Rule,
     Viewpoints,
     capture_cameras,
+    check_rule,
     draw,
     read_cameras,
     write_viewpoints,
@@ -46,8 +48,9 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     run = job.run
     if run.ladder != "nested":
         return
+    rule = Rule(_SEED, shift=config.shift, screens=config.screens, places=config.places)
     check_limits(config, "sample.")  # before an earlier result is given up
-    rule = Rule(_SEED, config.neighbours, config.shift, config.turn)
+    check_rule(rule)
 
     def make() -> list[str]:
         own, given = capture_cameras(job.scene), config.viewpoints
@@ -81,6 +84,7 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
     renders = _RENDERS * (train["max_steps"] + nest["steps"] + base_steps)
     compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice, for the bias three times
     levels = len(job.ladder.levels)
+    renders /= _mean_square(config.screens)
     cost = {"fit": levels + _LABEL_IMAGE, "bias": 1.5 * compositions, "calibration": compositions}
     part = renders / sum(DEFAULT_COUNTS[name] * cost[name] for name in DEFAULT_COUNTS)
     counts = {name: max(int(min(part, 1) * DEFAULT_COUNTS[name]), _FEWEST[name]) for name in DEFAULT_COUNTS}
@@ -92,6 +96,12 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
     counts["fit"] = config.views or counts["fit"]
     counts["calibration"] = config.calibration_views or counts["calibration"]
     return counts
+
+
+def _mean_square(screens: tuple[float, float]) -> float:
+    """Pixels of a drawn viewpoint over those of a photo, on average: s is log-uniform."""
+    low, high = screens
+    return (high**2 - low**2) / (2 * math.log(high / low)) if high > low else low**2
 
 
 def _until_it_stops_shrinking(
@@ -107,7 +117,9 @@ def _until_it_stops_shrinking(
         table = more if table is None else _joined(table, more)
         if stop == stops[-1]:
             break
-        models = fit_fidelity(table, cameras[:stop], job.scene.scale, fit.confidence)
+        models = fit_fidelity(
+            table, cameras[:stop], job.scene.scale, fit.confidence, drawn.focal, drawn.rule.screens
+        )
         errors.append(float(np.mean([model.rmse for model in models.values()])))
         if len(errors) > 1 and errors[-1] > (1 - _SHRINKS) * errors[-2]:
             break
@@ -115,7 +127,7 @@ def _until_it_stops_shrinking(
     if not (table.pixels > 0).any():
         raise RunError(
             f"{job.run.path}: none of {len(table.pixels)} viewpoints shows anything of the scene; draw them "
-            "closer to its cameras (--sample.shift, --sample.turn), or leave out --sample.viewpoints"
+            "closer to its cameras (--sample.shift, --sample.places 1 0 0), or leave out --sample.viewpoints"
         )
     return table, len(table.fidelity)
 

@@ -10,9 +10,9 @@ boxes that lie in all half spaces. If there are none, but boxes touch the frustu
 nearest centre of those boxes. Else it is NaN: out of sight. A box touches the frustum if in each half space
 its deepest corner is inside.
 
-Models know distances in photos. A window may be higher or wider than any photo, as on a phone, and show what
-lies at one's feet. So samples count inside the frustum of the photos' lens (`widest_lens`) at the same pose;
-where that has none, inside the window's.
+Models know distances in photos, and in pictures of the same area and other shapes. A window may be higher or
+wider than any of them and show what lies at one's feet. So samples count inside the frustum of their lens
+(`widest_lens`) at the same pose; where that has none, inside the window's.
 """
 
 import math

@@ -20,12 +20,14 @@ import numpy as np
 from jaxtyping import Float
 
 from sagesplat.adapt.process import matern32
-from sagesplat.adapt.viewpoint import Prediction, ViewModel
+from sagesplat.adapt.viewpoint import Prediction, ViewModel, where
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import boxes
 from sagesplat.viewer.frames import camera_at
 
-FOV_Y, ASPECT = math.radians(60), 16 / 9  # of the first view, as in the viewer on a usual screen
+# of the first view, as in the viewer on a usual screen
+FOV_Y, ASPECT = math.radians(60), 16 / 9
+_HEIGHT = 1080  # pixels
 _LEAST_SHARE = 1e-4  # least pixel share, so that every visible label counts
 _LEAST = 1e-6  # weight of labels out of sight, and least gain
 NEARBY = 2**18  # bytes of first levels out of sight that precede all finer levels
@@ -58,7 +60,7 @@ def order_of(
     """
     planes = boxes.frustum(position, quaternion, FOV_Y, ASPECT)
     photo = boxes.photo_frustum(position, quaternion, FOV_Y, ASPECT, lens)
-    camera = camera_at(position, quaternion, FOV_Y, 16, 9)
+    camera = camera_at(position, quaternion, FOV_Y, round(ASPECT * _HEIGHT), _HEIGHT)
     ranked, behind = [], []
     for index, ladder in enumerate(ladders):
         visible = not len(ladder.boxes) or boxes.touching(ladder.boxes, planes).any()
@@ -149,8 +151,7 @@ def _expected(
 
 
 def _predicted(model: ViewModel, camera: Camera, distance: float) -> Prediction:
-    position, direction = (value[None].astype(np.float64) for value in (camera.position, camera.direction))
-    return model.predict(np.array([distance]), position, direction)
+    return model.predict(np.array([distance]), *where([camera], model.focal))
 
 
 def _share(
@@ -160,8 +161,8 @@ def _share(
     if ladder.model is None or ladder.shares is None:
         return _apparent_size(ladder.boxes, position, planes)
     extent = ladder.model.extent
-    here, known = (
-        np.array([[*one.position / extent, *one.direction, 0.0] for one in some], np.float64)
+    here, known = (  # of place alone
+        np.array([[*one.position / extent, *one.direction, 0.0, 0.0] for one in some], np.float64)
         for some in ([camera], cameras)
     )
     near = matern32(here, known, ladder.model.lengths)[0]

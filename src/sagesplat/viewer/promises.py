@@ -19,11 +19,11 @@ from scipy.linalg import lstsq
 from scipy.spatial.distance import cdist
 
 from sagesplat.adapt.process import matern32
-from sagesplat.adapt.viewpoint import Calibration, Prediction, QualityKind, ViewModel
+from sagesplat.adapt.viewpoint import Calibration, Prediction, QualityKind, ViewModel, where
 from sagesplat.scene.scene import Camera
-from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.quality import curve_entry, significant
 from sagesplat.viewer.sent_model import (
+    AXES,
     CORRECTION_STEP,
     STEP,
     STEPS_PER_UNIT,
@@ -52,19 +52,20 @@ def promises_document(
     quality: QualityKind, models: Mapping[int, ViewModel], cameras: Sequence[Camera], seen: Mapping[int, Seen]
 ) -> dict[str, Any]:
     """The document of at least one model. `cameras`: the V viewpoints that `seen` is about."""
-    extent = next(iter(models.values())).extent
-    position = np.stack([camera.position for camera in cameras]).astype(np.float64)
-    direction = np.stack([camera.direction for camera in cameras]).astype(np.float64)
-    views = np.column_stack([position / extent, direction])
-    rows = {label: _nearest(model.inputs[:, :6], views) for label, model in models.items()}
+    some = next(iter(models.values()))
+    at = where(cameras, some.focal)
+    views = some.inputs_at(np.ones(len(cameras)), *at)[:, :7]
+    rows = {label: _nearest(model.inputs[:, :7], views) for label, model in models.items()}
     used = np.unique(np.concatenate(list(rows.values())))
     used = used[_path(views[used])]
     place = np.zeros(len(views), int)
     place[used] = np.arange(len(used))
-    shared = np.round(views[used] * np.tile(FLIP, 2) / STEP).astype(int)
+    shared = np.round(views[used] * AXES / STEP).astype(int)
     return {
         "quality": quality,
-        "extent": extent,
+        "extent": some.extent,
+        "focal": significant(some.focal),
+        "screens": significant(some.screens),
         "views": [_differences(column) for column in shared.T],
         "labels": [
             _entry(model, place[rows[label]], rows[label], used, shared, seen.get(label))
@@ -78,7 +79,7 @@ def _entry(
     places: Int[np.ndarray, " n"],
     rows: Int[np.ndarray, " n"],
     used: Int[np.ndarray, " U"],
-    shared: Int[np.ndarray, "U 6"],
+    shared: Int[np.ndarray, "U 7"],
     seen: Seen | None,
 ) -> dict[str, Any]:
     """The entry of a model; `places`: its views among the shared ones, `rows`: among the cameras."""
@@ -98,7 +99,6 @@ def _entry(
         "status": model.status,
         "confidence": model.confidence,
         "leastSupport": math.ceil(model.calibration.least_support / STEP) / STEPS_PER_UNIT,
-        "discount": math.ceil(model.calibration.discount / STEP) / STEPS_PER_UNIT,
         "medianLogDistance": significant(model.median_log_distance),
         "lengths": significant(model.lengths),
         "curves": [] if flat else [curve_entry(curve) for curve in model.curves],
@@ -110,19 +110,20 @@ def _entry(
     return _rounded(entry, replace(model, **ordered), shared)
 
 
-def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U 6"]) -> dict[str, Any]:
+def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U 7"]) -> dict[str, Any]:
     """The entry with log distances, values and thresholds, in the coarsest units that are allowed."""
     own = model.inputs
     at = np.concatenate([own, (own + own[_neighbours(own)]) / 2])
     # a curve may jump exactly at the distance of a view: a little beyond it
-    viewpoints = np.exp(at[:, 6]) * (1 + 1e-9), at[:, :3] * model.extent, at[:, 3:6]
+    place = at[:, :3] * model.extent, at[:, 3:6], np.exp(at[:, 6])
+    viewpoints = np.exp(at[:, 7]) * (1 + 1e-9), *place
     before = model.predict(*viewpoints)
     coarser = allowed_change(before.mean.mean(0)) / MAX_ROUNDING_CHANGE
     sent, change = entry, math.inf
     for log_unit, unit in _UNITS if len(own) <= MOST_VIEWS else _UNITS[:1]:
         sent = _with_values(entry, model, shared, log_unit, significant(unit * coarser, 4))
-        after = model_of_entry(sent, shared, model.extent).predict(*viewpoints)
-        change = _relative_change(before, after, model.calibration.discount)
+        after = model_of_entry(sent, shared, model.extent, model.screens).predict(*viewpoints)
+        change = _relative_change(before, after, model.calibration.slopes)
         if change <= 1:
             break
     return {**sent, **_thresholds(model.calibration, change)}
@@ -131,14 +132,20 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
 def _with_values(
     entry: dict[str, Any],
     model: ViewModel,
-    shared: Int[np.ndarray, "U 6"],
+    shared: Int[np.ndarray, "U 7"],
     log_unit: float,
     units: Sequence[float],
 ) -> dict[str, Any]:
     """The entry with log distances and values, by which it predicts what the model does."""
     own = model.inputs
-    logs = _differences(np.round(own[_sent_views(len(own)), 6] / log_unit))
-    sent = {**entry, "logDistances": {"unit": log_unit, "steps": logs}, "targets": [], "thresholds": []}
+    logs = _differences(np.round(own[_sent_views(len(own)), 7] / log_unit))
+    sent = {
+        **entry,
+        "logDistances": {"unit": log_unit, "steps": logs},
+        "targets": [],
+        "thresholds": [],
+        "slopes": [],
+    }
     inputs = inputs_of_entry(sent, shared)
     expected = matern32(own, own, model.lengths) @ model.weights
     found = lstsq(matern32(own, inputs, model.lengths), expected, cond=1e-9, lapack_driver="gelsy")
@@ -148,10 +155,11 @@ def _with_values(
     return sent
 
 
-def _relative_change(before: Prediction, after: Prediction, discount: float) -> float:
+def _relative_change(before: Prediction, after: Prediction, slopes: Float[np.ndarray, " G"]) -> float:
     """The largest change of what bounds come from, over what is allowed."""
-    change = after.mean - before.mean + discount * (after.support - before.support)[:, None]
-    return float((np.abs(change) / allowed_change(before.mean)).max())
+    steepest = np.abs(slopes).max(initial=0.0)
+    change = np.abs(after.mean - before.mean) + steepest * np.abs(after.support - before.support)[:, None]
+    return float((change / allowed_change(before.mean)).max())
 
 
 def allowed_change(mean: np.ndarray) -> np.ndarray:
@@ -160,25 +168,17 @@ def allowed_change(mean: np.ndarray) -> np.ndarray:
 
 
 def _thresholds(calibration: Calibration, change: float) -> dict[str, list[int]]:
-    """Targets and thresholds in whole steps; thresholds go up as means change, so no bound rises.
+    """Targets, thresholds and slopes in whole steps; thresholds go up as means change, so no bound rises.
 
     `change`: the largest change of a mean, over what is allowed.
     """
-    targets, thresholds = calibration.targets, calibration.thresholds
-    full = len(targets) > 0 and thresholds[-1] >= 1  # the full model keeps every target: that is not raised
-    just_below = 1 - 1.5 * STEP - change * MAX_ROUNDING_CHANGE
-    if full:  # targets that only the full model keeps must not lend theirs to means below
-        target = np.interp(just_below, thresholds, targets)
-        low = thresholds < just_below
-        targets, thresholds = [*targets[low], target, 1.0], np.array([*thresholds[low], just_below, 1.0])
-    targets = np.floor(np.array(targets) / STEP + 1e-6).astype(int)
-    raised = thresholds + change * allowed_change(thresholds)
-    raised = np.ceil(raised / STEP - 1e-6).astype(int)
-    rising = np.maximum.accumulate(raised - np.arange(len(raised))) + np.arange(len(raised))
-    kept = (rising < STEPS_PER_UNIT) & (np.diff(targets, prepend=-2 * STEPS_PER_UNIT) > 0)
-    if full:
-        rising[-1], kept[-1] = STEPS_PER_UNIT, True
-    return {"targets": targets[kept].tolist(), "thresholds": rising[kept].tolist()}
+    thresholds = calibration.thresholds
+    targets = np.floor(calibration.targets / STEP + 1e-6).astype(int)
+    raised = np.ceil((thresholds + change * allowed_change(thresholds)) / STEP - 1e-6).astype(int)
+    slopes = np.ceil(calibration.slopes / STEP - 1e-6).astype(int)
+    if len(targets) and thresholds[-1] >= 1:  # the full model keeps every target: that is not raised
+        raised[-1], slopes[-1] = STEPS_PER_UNIT, 0
+    return {"targets": targets.tolist(), "thresholds": raised.tolist(), "slopes": slopes.tolist()}
 
 
 def _differences(whole: np.ndarray) -> list[Any]:

@@ -36,7 +36,7 @@ def quality_entry(model: ViewModel) -> dict[str, Any]:
     null: no promise.
     """
     own = model.inputs
-    predicted = model.predict(np.exp(own[:, 6]), own[:, :3] * model.extent, own[:, 3:6])
+    predicted = model.predict(np.exp(own[:, 7]), own[:, :3] * model.extent, own[:, 3:6], np.exp(own[:, 6]))
     low = np.quantile(predicted.bound, 1 - model.confidence, axis=0, method="lower")
     return {
         "levels": list(model.levels),

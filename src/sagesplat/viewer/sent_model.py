@@ -23,7 +23,8 @@ from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.quality import curve_of
 
 NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncertain by
-STEP = 1e-4  # of positions over the extent, directions, shares, targets and thresholds
+STEP = 1e-4  # of positions over the extent, directions, log screens, shares, targets, thresholds and slopes
+AXES = np.array([*FLIP, *FLIP, 1.0])  # signs of position, direction and log screen in the bundle's axes
 CORRECTION_STEP = 5e-3
 STEPS_PER_UNIT = round(1 / STEP)
 NEIGHBOUR_EXPONENT = 16  # of the kernel weights in `corrected`: only close views count
@@ -39,8 +40,9 @@ class SentModel:
     offsets: Float[np.ndarray, " K"]
     extent: float
     median_log_distance: float
-    inputs: Float[np.ndarray, "n 7"]
-    lengths: tuple[float, float, float]
+    screens: tuple[float, float]
+    inputs: Float[np.ndarray, "n 8"]
+    lengths: tuple[float, float, float, float]
     weights: Float[np.ndarray, "n K"]
     corrections: Float[np.ndarray, " n"]
     calibration: Calibration
@@ -50,9 +52,11 @@ class SentModel:
         distance: Float[np.ndarray, " V"],
         position: Float[np.ndarray, "V 3"],
         direction: Float[np.ndarray, "V 3"],
+        screen: Float[np.ndarray, " V"] | None = None,
     ) -> Prediction:
         """Like `ViewModel.predict`."""
-        x = inputs_of(distance, position, direction, self.extent, self.median_log_distance)
+        screen = None if screen is None else np.clip(screen, *self.screens)
+        x = inputs_of(distance, position, direction, self.extent, self.median_log_distance, screen)
         near = matern32(x, self.inputs, self.lengths)
         curves = means_at(self.curves, distance) if self.curves else 0.0
         mean = monotone(curves + self.offsets + near @ self.weights)
@@ -67,11 +71,11 @@ class SentModel:
     ) -> Float[np.ndarray, " V"]:
         """Distances by boxes, corrected by their errors in the model's views nearby.
 
-        d exp(sum_i a_i^16 c_i / (sum_i a_i^16 + 0.001)), where a_i is the model's kernel without the distance
-        input. In leave-one-out tests on `garden` and `dinosaur` this halves the error of the bounds.
+        d exp(sum_i a_i^16 c_i / (sum_i a_i^16 + 0.001)), where a_i is the model's kernel of place alone. In
+        leave-one-out tests on `garden` and `dinosaur` this halves the error of the bounds.
         """
-        here = np.column_stack([position / self.extent, direction, np.zeros(len(position))])
-        known = np.column_stack([self.inputs[:, :6], np.zeros(len(self.inputs))])
+        here = np.column_stack([position / self.extent, direction, np.zeros((len(position), 2))])
+        known = np.column_stack([self.inputs[:, :6], np.zeros((len(self.inputs), 2))])
         weights = matern32(here, known, self.lengths) ** NEIGHBOUR_EXPONENT
         return distance * np.exp(weights @ self.corrections / (weights.sum(1) + HALF_WEIGHT))
 
@@ -80,20 +84,22 @@ def read_model(document: dict[str, Any], label_id: int) -> SentModel:
     """The model of a label in a document."""
     (entry,) = (entry for entry in document["labels"] if entry["id"] == label_id)
     shared = np.cumsum(document["views"], 1).T
-    return model_of_entry(entry, shared, document["extent"])
+    return model_of_entry(entry, shared, document["extent"], document["screens"])
 
 
-def model_of_entry(entry: dict[str, Any], shared: Int[np.ndarray, "U 6"], extent: float) -> SentModel:
+def model_of_entry(
+    entry: dict[str, Any], shared: Int[np.ndarray, "U 7"], extent: float, screens: Sequence[float]
+) -> SentModel:
     """The model of an entry; `shared`: the views that the labels share, in steps."""
     inputs = inputs_of_entry(entry, shared)
-    x, y, z = entry["lengths"]
+    lengths = position, direction, screen, distance = entry["lengths"]
     values = np.cumsum(np.cumsum(entry["values"]["steps"], 0), 1).T * entry["values"]["units"]
-    weights = cho_solve(cho_factor(covariance(inputs, (x, y, z))), values)
-    targets, thresholds = (
-        np.array(entry[name], np.float64) / STEPS_PER_UNIT for name in ("targets", "thresholds")
+    weights = cho_solve(cho_factor(covariance(inputs, lengths)), values)
+    targets, thresholds, slopes = (
+        np.array(entry[name], np.float64) / STEPS_PER_UNIT for name in ("targets", "thresholds", "slopes")
     )
     calibration = Calibration(
-        entry["status"], entry["confidence"], 0, targets, thresholds, entry["leastSupport"], entry["discount"]
+        entry["status"], entry["confidence"], 0, targets, thresholds, slopes, entry["leastSupport"]
     )
     return SentModel(
         levels=tuple(entry["levels"]),
@@ -101,21 +107,22 @@ def model_of_entry(entry: dict[str, Any], shared: Int[np.ndarray, "U 6"], extent
         offsets=np.array(entry["offsets"], np.float64),
         extent=extent,
         median_log_distance=entry["medianLogDistance"],
+        screens=(screens[0], screens[1]),
         inputs=inputs,
-        lengths=(x, y, z),
+        lengths=(position, direction, screen, distance),
         weights=weights,
         corrections=np.cumsum(entry["corrections"]) * CORRECTION_STEP,
         calibration=calibration,
     )
 
 
-def inputs_of_entry(entry: dict[str, Any], shared: Int[np.ndarray, "U 6"]) -> Float[np.ndarray, "n 7"]:
-    """Scaled position, direction and log distance of an entry's views."""
-    own = shared[np.cumsum(entry["views"])] / STEPS_PER_UNIT * np.tile(FLIP, 2)
+def inputs_of_entry(entry: dict[str, Any], shared: Int[np.ndarray, "U 7"]) -> Float[np.ndarray, "n 8"]:
+    """Scaled position, direction, log screen and log distance of an entry's views."""
+    own = shared[np.cumsum(entry["views"])] / STEPS_PER_UNIT * AXES
     logs = np.cumsum(entry["logDistances"]["steps"]) * entry["logDistances"]["unit"]
     return np.column_stack([own, logs])
 
 
-def covariance(inputs: Float[np.ndarray, "n 7"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
+def covariance(inputs: Float[np.ndarray, "n 8"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
     """The kernel between all views, with the nugget."""
     return matern32(inputs, inputs, lengths) + NUGGET * np.eye(len(inputs))

@@ -112,19 +112,21 @@ def _models(folder: Path, size: int) -> list[bytes]:
 
 def _promises(folder: Path, size: int) -> list[bytes]:
     curve = json.loads(_models(folder, 1)[0])["models"][0]
-    entry = dict.fromkeys(("extent", "median_log_distance", "heldout_variance", "rmse"), 0.5) | {
+    entry = dict.fromkeys(("extent", "median_log_distance", "heldout_variance", "rmse", "focal"), 0.5) | {
         "curves": [curve],
-        "lengths": [1, 2, 0.5],
+        "lengths": [1, 2, 0.5, 0.7],
+        "screens": [0.5, 2],
     }
-    entry |= {"inputs": [[0.1] * 7, [0.2] * 7], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
+    entry |= {"inputs": [[0.1] * 8, [0.2] * 8], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
     calibration = {"status": sorted(viewpoint.STATUSES)[0], "confidence": 0.95, "num_views": 20}
     calibration |= {"targets": [0.5, 0.7], "thresholds": [0.52, 0.7], "least_support": 0.2}  # type: ignore
+    calibration |= {"slopes": [0.1, 0]}
     entry |= {"quality": "fidelity", "calibration": calibration}  # type: ignore
     return as_json({"promises": [entry | {"label_id": 2 + i} for i in range(size)]})
 
 
 def _write_viewpoints(path: Path, size: int) -> None:
-    drawn = viewpoints.Viewpoints(viewpoints.Rule(), "capture", (CAMERA,) * size, ("fit",) * size)
+    drawn = viewpoints.Viewpoints(viewpoints.Rule(), "capture", 4.0, (CAMERA,) * size, ("fit",) * size)
     viewpoints.write_viewpoints(path, drawn)
 
 

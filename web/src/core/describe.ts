@@ -1,6 +1,6 @@
 /** The state of a streamer as numbers and messages, for the UI and tests. */
 
-import type { LabelState, State } from "../types";
+import type { LabelState, Screens, State } from "../types";
 import { type Failure, TRIES_BEFORE_NOTICE } from "./downloads";
 import type { Entry } from "./residency";
 
@@ -11,6 +11,7 @@ export interface Overview {
   readonly bandwidth: number;
   readonly pending: number;
   readonly leavingBytes: number; // GPU bytes of removed labels that are still drawn
+  readonly screens: Screens | null;
   readonly notes: readonly (string | null | undefined)[]; // most important first
   failure(entry: Entry, level: number): Failure | undefined;
 }
@@ -29,13 +30,15 @@ export function describe(entries: readonly Entry[], overview: Overview): State {
     count: sum((label) => label.count),
     bandwidth: overview.bandwidth,
     pending: overview.pending,
+    screens: overview.screens,
     message: [...errors, ...overview.notes].find((note) => note) ?? null,
   };
 }
 
 function labelState(entry: Entry, overview: Overview): LabelState {
   const { label, wanted, sight, prediction } = entry;
-  const { level, ladder } = entry.former ?? { level: entry.shown, ladder: entry.ladder };
+  const { former } = entry;
+  const { level, ladder } = former ?? { level: entry.shown, ladder: entry.ladder };
   return {
     label,
     wanted,
@@ -44,13 +47,26 @@ function labelState(entry: Entry, overview: Overview): LabelState {
     error: errorOf(entry, overview),
     visible: sight.visible,
     distance: sight.distance,
-    promised: prediction.bound[level - 1] ?? Number.NaN,
-    expected: prediction.mean[level - 1] ?? Number.NaN,
+    // the prediction is of the new content, and nothing is known of one that is not drawn
+    promised: (former ? undefined : prediction.bound[level - 1]) ?? Number.NaN,
+    expected: (former ? undefined : prediction.mean[level - 1]) ?? Number.NaN,
     trust: prediction.trust,
     count: ladder.count[level - 1] ?? 0,
     bytes: ladder.bytes[level - 1] ?? 0,
     gpuBytes: ladder.gpuBytes[level - 1] ?? 0,
   };
+}
+
+/**
+ * The least quality promised of some labels as they are drawn; NaN where one is not drawn, or has a level without
+ * a promise. Where nothing is known of a label, its last level stands for the full scene.
+ */
+export function leastPromise(labels: readonly LabelState[]): number {
+  const promised = labels.map(({ promised, shown, label }) =>
+    Number.isNaN(promised) && shown === label.levels.length ? Infinity : promised,
+  );
+  const least = Math.min(...promised);
+  return least < Infinity ? least : Number.NaN;
 }
 
 function errorOf(entry: Entry, overview: Overview): string | null {

@@ -20,16 +20,25 @@ const AT = [1 / 6, 1 / 2, 5 / 6]; // sample positions along each axis of a box
 /** Half width and half height of a picture at distance 1. */
 export type Lens = readonly [number, number];
 
-/** The largest of the cameras' pictures; null without cameras. */
+const LONGEST = 20 / 9; // of the sides of a picture that models know, the longer over the shorter
+
+/**
+ * The largest of the pictures that models know, by the photos' cameras: theirs, and those of other shapes and the
+ * same area. Null without cameras. Same formula as `widest_lens` in src/sagesplat/adapt/observe.py.
+ */
 export function widestLens(cameras: readonly Camera[]): Lens | null {
-  const largest = (of: (camera: Camera) => number) => Math.max(...cameras.map(of)) / 2;
   if (!cameras.length) return null;
-  return [largest((c) => c.width / c.intrinsics[0]), largest((c) => c.height / c.intrinsics[1])];
+  const largest = (side: "width" | "height", focal: 0 | 1) =>
+    Math.max(...cameras.map((c) => Math.max(c[side] / c.intrinsics[focal], longest(c)))) / 2;
+  return [largest("width", 0), largest("height", 1)];
 }
+
+const longest = ({ width, height, intrinsics: [fx, fy] }: Camera): number =>
+  Math.sqrt((width * height * LONGEST) / (fx * fy));
 
 /**
  * The frustum of a viewpoint, but no wider and no higher than a lens; the same one if it is not.
- * Models know distances in photos: a phone held upright also shows what lies at one's feet.
+ * Models know distances in such pictures: a window that is higher also shows what lies at one's feet.
  */
 export function photoFrustum(
   { position, direction, frustum }: Viewpoint,

@@ -15,7 +15,7 @@ export function normalised(settings: Settings): Settings {
 
 /** Whether two viewpoints are equal. */
 export function same(a: Viewpoint, b: Viewpoint): boolean {
-  const numbers = (v: Viewpoint) => [...v.position, ...v.direction, ...v.frustum.flat()];
+  const numbers = (v: Viewpoint) => [...v.position, ...v.direction, ...v.frustum.flat(), v.focal];
   const [x, y] = [numbers(a), numbers(b)];
   return x.length === y.length && x.every((value, i) => value === y[i]);
 }

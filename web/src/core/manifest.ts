@@ -110,6 +110,10 @@ export function parsePromises(json: string, file: string, quality: Quality): Pro
   refuse(even ? [] : ["views must have columns of equal length"], file);
   refuse(found.quality === quality ? [] : [`quality must be ${JSON.stringify(quality)}`], file);
   refuse(
+    found.screens[0] <= found.screens[1] ? [] : ["screens must be from the smaller to the larger"],
+    file,
+  );
+  refuse(
     found.labels.flatMap((one, i) => modelDefects(one, shared).map((what) => `labels[${i}]${what}`)),
     file,
   );
@@ -125,25 +129,29 @@ function modelDefects(one: LabelPromises, shared: number): string[] {
     (one.curves.length === K || !one.curves.length) &&
     one.shares.length === shared &&
     total(one.views) < shared &&
-    one.thresholds.length === one.targets.length;
+    [one.thresholds, one.slopes].every((values) => values.length === one.targets.length);
   if (!fit) return [" has lists that do not fit together"];
   const wrong: string[] = [];
   if (!isRising(one.levels)) wrong.push(".levels must rise");
-  for (const values of [one.targets, one.thresholds]) {
-    if (!isRising(values) || values.some((v) => Math.abs(v) > WHOLE)) {
-      wrong.push(" must have targets and thresholds that rise from -1 to 1");
-    }
+  if (!isRising(one.targets) || !below(one.targets, WHOLE)) {
+    wrong.push(".targets must rise, from -1 to 1");
   }
+  if (!below(one.thresholds, MOST) || !below(one.slopes, MOST))
+    wrong.push(" has thresholds or slopes out of range");
   if (!within(one.shares, WHOLE) || !within(one.corrections, 1e5))
     wrong.push(" has shares or corrections out of range");
   const logs = one.logDistances;
-  if (!within(logs.steps, 100 / logs.unit) || one.values.steps.some((row) => !within(row, 1e9))) {
+  if (!within(logs.steps, 100 / logs.unit) || one.values.steps.some((row) => !within(row, MOST))) {
     wrong.push(" has values out of range");
   }
   return wrong;
 }
 
-const WHOLE = 10_000; // steps of shares, targets and thresholds in 1
+const WHOLE = 10_000; // steps of shares and targets in 1
+const MOST = 1e9; // steps of anything
+
+const below = (values: readonly number[], most: number): boolean =>
+  values.every((value) => Math.abs(value) <= most);
 
 const isRising = (values: readonly number[]): boolean =>
   values.every((value, i) => i === 0 || value > (values[i - 1] ?? 0));

@@ -21,14 +21,14 @@ export function maternTable(square: number): number {
   return low + (at - i) * ((TABLE[i + 1] as number) - low);
 }
 
-/** The lower half of C + NUGGET I for n views, whose inputs [n, 7] are divided by the length scales. */
+/** The lower half of C + NUGGET I for n views, whose inputs [n, 8] are divided by the length scales. */
 export function covariance(scaled: Float64Array, n: number): Float64Array {
   const S = new Float64Array(n * n);
   for (let i = 0; i < n; i++) {
     for (let j = 0; j <= i; j++) {
       let square = 0;
-      for (let k = 0; k < 7; k++) {
-        const apart = (scaled[7 * i + k] as number) - (scaled[7 * j + k] as number);
+      for (let k = 0; k < 8; k++) {
+        const apart = (scaled[8 * i + k] as number) - (scaled[8 * j + k] as number);
         square += apart * apart;
       }
       S[i * n + j] = matern(square) + (i === j ? NUGGET : 0);

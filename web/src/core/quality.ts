@@ -3,7 +3,7 @@
  * adapt/viewpoint.py; tests/data/promises.json checks them.
  */
 
-import type { Curve, Label, LabelPromises, Promises, Quality, Trust, Vec3 } from "../types";
+import type { Curve, Label, LabelPromises, Promises, Quality, Trust, Viewpoint } from "../types";
 import { covariance, matern, maternTable, solved } from "./process";
 
 /** The prediction for one label at one viewpoint. */
@@ -14,7 +14,10 @@ export interface Prediction {
   readonly trust: Trust;
 }
 
-/** Steps in which promises hold positions over the extent, directions, shares, targets and thresholds. */
+/** Where and on what screen: all that models know of a viewpoint. */
+type From = Pick<Viewpoint, "position" | "direction" | "focal">;
+
+/** Steps of positions over the extent, directions, log screens, shares, targets, thresholds and slopes. */
 const STEP = 1e-4;
 const CORRECTION_STEP = 5e-3;
 
@@ -45,37 +48,46 @@ export function anywhere(label: Label, quality: Quality): Prediction {
 const NEIGHBOUR_EXPONENT = 16;
 const HALF_WEIGHT = 1e-3;
 
-/** The views that the models of all labels share, and their scaled distances from the current viewpoint. */
+const COLUMNS = 7; // of the shared views: position over the extent, direction, log screen
+
+/** The views that the models of all labels share, and how far they are from the current viewpoint. */
 export class Views {
   readonly away: Float64Array; // [V] square of the distance over the extent
   readonly turned: Float64Array; // [V] square of the difference of the directions
-  readonly rows: Float64Array; // [V, 6]
-  private readonly extent: number;
-  private position: Vec3 | null = null;
-  private direction: Vec3 | null = null;
+  readonly rescaled: Float64Array; // [V] square of the difference of the log screens
+  readonly rows: Float64Array; // [V, COLUMNS]
+  private last: From | null = null;
 
-  constructor({ views, extent }: Promises) {
-    const columns = views.map((column) => sums(column, STEP));
+  constructor(private readonly sent: Pick<Promises, "views" | "extent" | "focal" | "screens">) {
+    const columns = sent.views.map((column) => sums(column, STEP));
     const count = columns[0]?.length ?? 0;
-    this.rows = Float64Array.from({ length: 6 * count }, (_, i) => columns[i % 6]?.[Math.floor(i / 6)] ?? 0);
-    this.extent = extent;
+    const at = (i: number) => columns[i % COLUMNS]?.[Math.floor(i / COLUMNS)] ?? 0;
+    this.rows = Float64Array.from({ length: COLUMNS * count }, (_, i) => at(i));
     this.away = new Float64Array(count);
     this.turned = new Float64Array(count);
+    this.rescaled = new Float64Array(count);
   }
 
-  /** Computes `away` and `turned` for a viewpoint, once for all labels. */
-  from(position: Vec3, direction: Vec3): void {
-    if (position === this.position && direction === this.direction) return;
-    [this.position, this.direction] = [position, direction];
-    const { rows, extent } = this;
-    const [x, y, z] = [position[0] / extent, position[1] / extent, position[2] / extent];
-    const [a, b, c] = direction;
-    for (let i = 0, at = 0; i < this.away.length; i++, at += 6) {
+  /** Computes the differences from a viewpoint, once for all labels. */
+  from(viewpoint: From): void {
+    if (viewpoint === this.last) return;
+    this.last = viewpoint;
+    const { rows, sent } = this;
+    const [x, y, z] = viewpoint.position.map((p) => p / sent.extent) as [number, number, number];
+    const [a, b, c] = viewpoint.direction;
+    const [least, most] = sent.screens;
+    const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), least), most));
+    for (let i = 0, at = 0; i < this.away.length; i++, at += COLUMNS) {
       this.away[i] = square(x, y, z, rows, at);
       this.turned[i] = square(a, b, c, rows, at + 3);
+      this.rescaled[i] = (screen - (rows[at + 6] as number)) ** 2;
     }
   }
 }
+
+/** A viewpoint's screen: the focal length of what is drawn over the photos'. */
+export const screenOf = ({ focal }: Pick<Viewpoint, "focal">, photos: Pick<Promises, "focal">): number =>
+  (focal ?? photos.focal) / photos.focal;
 
 function square(x: number, y: number, z: number, rows: Float64Array, at: number): number {
   const dx = x - (rows[at] as number);
@@ -93,7 +105,8 @@ export class ViewModel {
   private readonly shares: Float64Array; // [V]
   private readonly targets: Float64Array;
   private readonly thresholds: Float64Array;
-  private readonly scale: Vec3; // of squares: of positions, directions, log distances
+  private readonly slopes: Float64Array;
+  private readonly scale: readonly [number, number, number, number]; // of squares, by group of inputs
   private readonly meanShare: number;
 
   constructor(
@@ -107,8 +120,9 @@ export class ViewModel {
     this.shares = sums(sent.shares, STEP);
     this.targets = Float64Array.from(sent.targets, (target) => target * STEP);
     this.thresholds = Float64Array.from(sent.thresholds, (threshold) => threshold * STEP);
-    const [x, y, z] = sent.lengths;
-    this.scale = [x ** -2, y ** -2, z ** -2];
+    this.slopes = Float64Array.from(sent.slopes, (slope) => slope * STEP);
+    const [position, direction, screen, log] = sent.lengths;
+    this.scale = [position ** -2, direction ** -2, screen ** -2, log ** -2];
     this.meanShare = this.shares.reduce((sum, s) => sum + s, 0) / Math.max(this.shares.length, 1);
   }
 
@@ -119,20 +133,21 @@ export class ViewModel {
 
   /**
    * @param distance - to the label, the bundle's units, NaN: unknown
-   * @param position - of the viewer, the bundle's units
-   * @param direction - in which it looks, unit length
+   * @param viewpoint - in the bundle's frame
    */
-  predict(distance: number, position: Vec3, direction: Vec3): Prediction {
-    const { sent, scale } = this;
-    this.views.from(position, direction);
+  predict(distance: number, viewpoint: From): Prediction {
+    const { sent, scale, views } = this;
+    views.from(viewpoint);
     this.weights ??= this.solve();
     const n = this.own.length;
     const log = distance > 0 && distance < Infinity ? Math.log(distance) : sent.medianLogDistance;
     const near = new Float64Array(n);
     let support = 0;
     for (let i = 0; i < n; i++) {
+      const view = this.own[i] as number;
       const further = log - (this.logDistances[i] as number);
-      near[i] = matern(this.square(this.own[i] as number) + further * further * scale[2]);
+      const seen = (views.rescaled[view] as number) * scale[2] + further * further * scale[3];
+      near[i] = matern(this.square(view) + seen);
       support = Math.max(support, near[i] as number);
     }
     const { weights } = this;
@@ -146,8 +161,8 @@ export class ViewModel {
   }
 
   /** A distance by boxes, corrected by their errors in the label's views nearby; NaN stays NaN. */
-  corrected(distance: number, position: Vec3, direction: Vec3): number {
-    this.views.from(position, direction);
+  corrected(distance: number, viewpoint: From): number {
+    this.views.from(viewpoint);
     let [sum, total] = [0, 0];
     for (let i = 0; i < this.own.length; i++) {
       const weight = matern(this.square(this.own[i] as number)) ** NEIGHBOUR_EXPONENT;
@@ -158,9 +173,9 @@ export class ViewModel {
   }
 
   /** The label's pixel share at a viewpoint, from the known views near it, 0..1. */
-  share(position: Vec3, direction: Vec3): number {
+  share(viewpoint: From): number {
     const { shares } = this;
-    this.views.from(position, direction);
+    this.views.from(viewpoint);
     let [sum, total] = [0, 0];
     for (let view = 0; view < shares.length; view++) {
       const alike = maternTable(this.square(view));
@@ -170,7 +185,7 @@ export class ViewModel {
     return total > 1e-12 ? sum / total : this.meanShare;
   }
 
-  /** Square of the scaled difference between the current viewpoint and a view. */
+  /** Square of the scaled difference in place between the current viewpoint and a view. */
   private square(view: number): number {
     return (
       (this.views.away[view] as number) * this.scale[0] + (this.views.turned[view] as number) * this.scale[1]
@@ -182,8 +197,8 @@ export class ViewModel {
     const unknown = label.levels.map(() => Number.NaN);
     const known = this.targets.length > 0;
     const outside = support < sent.leastSupport;
-    const less = sent.discount * (1 - support);
-    const bound = mean.map((m) => (outside || !known ? Number.NaN : this.bound(m - less)));
+    const needed = this.needed(support);
+    const bound = mean.map((m) => (outside || !known ? Number.NaN : this.bound(m, needed)));
     return {
       mean: spread(mean, sent.levels, unknown),
       bound: spread(bound, sent.levels, unknown),
@@ -192,15 +207,24 @@ export class ViewModel {
     };
   }
 
+  /** The mean from which on a level keeps each target at a support: never less than for a lower target, at most 1. */
+  private needed(support: number): Float64Array {
+    let least = -Infinity;
+    return this.thresholds.map((threshold, g) => {
+      least = Math.max(least, threshold + (this.slopes[g] as number) * (1 - support));
+      return Math.min(least, 1);
+    });
+  }
+
   /** The largest target that a mean keeps, between targets interpolated. */
-  private bound(mean: number): number {
-    const { targets, thresholds } = this;
+  private bound(mean: number, needed: Float64Array): number {
+    const { targets } = this;
     const last = targets.length - 1;
-    const above = thresholds.findIndex((threshold) => threshold > mean);
+    const above = needed.findIndex((threshold) => threshold > mean);
     if (above < 0) return targets[last] as number;
-    const [t1, m1] = [targets[above] as number, thresholds[above] as number];
+    const [t1, m1] = [targets[above] as number, needed[above] as number];
     if (above === 0) return mean + (t1 - m1);
-    const [t0, m0] = [targets[above - 1] as number, thresholds[above - 1] as number];
+    const [t0, m0] = [targets[above - 1] as number, needed[above - 1] as number];
     return t0 + ((t1 - t0) / (m1 - m0)) * (mean - m0);
   }
 
@@ -208,12 +232,13 @@ export class ViewModel {
   private solve(): Float64Array {
     const { own, scale, logDistances, sent } = this;
     const { rows } = this.views;
-    const [a, b, c] = scale.map(Math.sqrt) as [number, number, number];
-    const scaled = new Float64Array(7 * own.length);
-    for (let i = 0; i < own.length; i++) {
-      for (let j = 0; j < 6; j++)
-        scaled[7 * i + j] = (rows[6 * (own[i] as number) + j] as number) * (j < 3 ? a : b);
-      scaled[7 * i + 6] = (logDistances[i] as number) * c;
+    const [a, b, c, d] = scale.map(Math.sqrt) as [number, number, number, number];
+    const by = [a, a, a, b, b, b, c];
+    const scaled = new Float64Array((COLUMNS + 1) * own.length);
+    for (let i = 0, at = 0; i < own.length; i++) {
+      const row = COLUMNS * (own[i] as number);
+      for (const [j, factor] of by.entries()) scaled[at++] = (rows[row + j] as number) * factor;
+      scaled[at++] = (logDistances[i] as number) * d;
     }
     return solved(covariance(scaled, own.length), valuesOf(sent), own.length);
   }

@@ -1,6 +1,16 @@
 /** Streams a bundle: plans, downloads, decodes and draws increments. The only stateful part of the core. */
 
-import type { Handle, Level, Manifest, Quality, Renderer, Settings, State, Viewpoint } from "../types";
+import type {
+  Handle,
+  Level,
+  Manifest,
+  Quality,
+  Renderer,
+  Screens,
+  Settings,
+  State,
+  Viewpoint,
+} from "../types";
 import { describe } from "./describe";
 import { type Lens, photoFrustum, rotate, widestLens } from "./distance";
 import { type Clock, clockOfBrowser, type Digest, digestOfBrowser, type Fetch, type File } from "./download";
@@ -11,6 +21,7 @@ import { parsePromises } from "./manifest";
 import { inOrder } from "./order";
 import { filesOf } from "./pack";
 import { makePlan, type Plan } from "./planner";
+import { screenOf } from "./quality";
 import { type Drawn, Entry, exchange, gpuBytesOf, Hidden, settle } from "./residency";
 import { ViewpointModels } from "./viewpoints";
 
@@ -397,6 +408,13 @@ export class Streamer {
     });
   }
 
+  private screens(): Screens | null {
+    const { promises } = this.models;
+    if (!promises) return null;
+    const [least, most] = promises.screens;
+    return { least, most, here: screenOf(this.viewpoint, promises) };
+  }
+
   private describe(): State {
     const promises = this.promises && this.downloads.failure(this.promises);
     return describe(this.entries, {
@@ -405,6 +423,7 @@ export class Streamer {
       bandwidth: this.downloads.bandwidth.rate,
       pending: this.pending,
       leavingBytes: this.leaving.reduce((sum, drawn) => sum + gpuBytesOf(drawn), 0),
+      screens: this.screens(),
       notes: [
         this.trouble,
         this.downloads.note,

@@ -8,16 +8,14 @@ import type { Entry } from "./residency";
 
 /** Without viewpoint models, quality is the same everywhere and pixel share depends on the size of the boxes. */
 export class ViewpointModels {
-  readonly complete: boolean; // whether it has the viewpoint models
   private readonly models = new Map<number, ViewModel>();
   private readonly wherever = new Map<number, Prediction>(); // without a viewpoint model, or out of sight
 
   constructor(
     readonly quality: Quality,
     labels: readonly Label[] = [],
-    promises: Promises | null = null,
+    readonly promises: Promises | null = null,
   ) {
-    this.complete = promises !== null;
     for (const label of labels) this.wherever.set(label.id, anywhere(label, quality));
     if (!promises) return;
     const views = new Views(promises);
@@ -28,10 +26,14 @@ export class ViewpointModels {
     }
   }
 
+  /** Whether it has the viewpoint models. */
+  get complete(): boolean {
+    return this.promises !== null;
+  }
+
   /** Evaluates a label at the viewpoint; `photo`: its `photoFrustum`. */
   see(entry: Entry, viewpoint: Viewpoint, photo: Viewpoint["frustum"] = viewpoint.frustum): void {
     const { label } = entry;
-    const { position, direction } = viewpoint;
     const model = this.models.get(label.id);
     const seen = look(label.boxes, viewpoint, photo);
     if (!seen.visible && label.boxes.length) {
@@ -41,12 +43,12 @@ export class ViewpointModels {
       entry.share = seen.size;
       return;
     }
-    const distance = model?.corrected(seen.distance, position, direction) ?? seen.distance;
+    const distance = model?.corrected(seen.distance, viewpoint) ?? seen.distance;
     const sight = { ...seen, distance };
     // a label without boxes may be anywhere
     entry.sight = label.boxes.length ? sight : { ...sight, visible: true };
-    entry.prediction = model?.predict(distance, position, direction) ?? this.elsewhere(label);
-    entry.share = model ? model.share(position, direction) : this.complete ? 0 : sight.size;
+    entry.prediction = model?.predict(distance, viewpoint) ?? this.elsewhere(label);
+    entry.share = model ? model.share(viewpoint) : this.complete ? 0 : sight.size;
   }
 
   private elsewhere(label: Label): Prediction {

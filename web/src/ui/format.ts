@@ -1,4 +1,4 @@
-import type { Quality } from "../types";
+import type { Quality, Screens } from "../types";
 
 /** "1.2 MB", with at least two digits; decimal units. */
 export function formatBytes(bytes: number): string {
@@ -27,6 +27,19 @@ export function formatDistance(metres: number): string {
 
 /** What a quality is called in a sentence. */
 export const nameOf = (quality: Quality): string => (quality === "fidelity" ? "fidelity" : "SSIM");
+
+/**
+ * The screens that promises are for. A larger one is promised what its picture has, averaged down to the largest.
+ *
+ * @param height - of what is drawn, pixels
+ */
+export function formatScreens({ least, most, here }: Screens, height: number): string {
+  const from = least < most ? `${Number(least.toPrecision(2))} to ` : "";
+  const times = `of ${from}${Number(most.toPrecision(2))} times the photos' sharpness`;
+  const known = `Promises are for screens ${least === 1 && most === 1 ? "as sharp as the photos" : times}`;
+  const averaged = `; compared as averaged down to ${Math.round((height * most) / here)} px`;
+  return here > most ? known + averaged : known;
+}
 
 export function formatSsim(ssim: number): string {
   return Number.isFinite(ssim) ? ssim.toFixed(2) : "–";

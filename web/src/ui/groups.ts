@@ -1,3 +1,4 @@
+import { leastPromise } from "../core/describe";
 import { ladderOf } from "../core/planner";
 import type { LabelState, Trust } from "../types";
 
@@ -14,7 +15,8 @@ export interface Summary {
   readonly shown: number; // share of its levels
   readonly wanted: number;
   readonly level: string; // "2/6", or "1–4/6" if the blocks differ
-  readonly promised: number; // minimum over visible labels
+  readonly promised: number; // minimum over visible labels; NaN if one of them has none
+  readonly missing: boolean; // whether a visible label is not drawn
   readonly expected: number;
   readonly trust: Trust; // the least over visible labels
   readonly count: number;
@@ -64,21 +66,22 @@ export function summary(states: readonly LabelState[]): Summary {
   const sum = (of: (state: LabelState) => number) => states.reduce((total, state) => total + of(state), 0);
   const levels = sum(({ label }) => label.levels.length);
   const visible = states.filter((state) => state.visible);
+  const counted = visible.length ? visible : states;
   const least = (of: (state: LabelState) => number) => {
-    const known = (visible.length ? visible : states).map(of).filter((value) => !Number.isNaN(value));
+    const known = counted.map(of).filter((value) => !Number.isNaN(value));
     return known.length ? Math.min(...known) : Number.NaN;
   };
-  const shown = (visible.length ? visible : states).map((state) => state.shown);
+  const shown = counted.map((state) => state.shown);
   const [low, high] = [Math.min(...shown), Math.max(...shown)];
   const last = Math.max(...states.map(({ label }) => label.levels.length));
   return {
     shown: sum((state) => state.shown) / levels,
     wanted: sum((state) => state.wanted) / levels,
     level: `${low === high ? low : `${low}–${high}`}/${last}`,
-    promised: least((state) => state.promised),
+    promised: leastPromise(counted),
+    missing: visible.some((state) => !state.shown),
     expected: least((state) => state.expected),
-    trust:
-      TRUST.find((trust) => (visible.length ? visible : states).some((s) => s.trust === trust)) ?? "unknown",
+    trust: TRUST.find((trust) => counted.some((s) => s.trust === trust)) ?? "unknown",
     count: sum((state) => state.count),
     bytes: sum((state) => state.bytes),
     distance: least((state) => state.distance),

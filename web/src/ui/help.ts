@@ -24,7 +24,7 @@ export function helpDialog(): HTMLDialogElement {
   const note = h(
     "p",
     { class: "hint" },
-    "Every category has levels of detail. Quality chooses the smallest levels whose promised quality reaches the target from where you are; Budget chooses the best levels that fit. Quality is SSIM: against the full scene seen from the same place (fidelity), or against the photos. A promise is a lower bound that holds in 95 of 100 decisions, tried at viewpoints that nothing was fitted to. Far from all viewpoints that were tried there is no promise: the category is then shown in full.",
+    "Every category has levels of detail. Quality chooses the smallest levels whose promised quality reaches the target from where you are; Budget chooses the best levels that fit. Quality is SSIM: against the full scene seen from the same place (fidelity), or against the photos. A promise is a lower bound that holds in 95 of 100 decisions, tried at viewpoints that nothing was fitted to, on screens of the sharpness that the panel names; while something in sight is missing, none is given. Far from all viewpoints that were tried there is no promise: the category is then shown in full.",
   );
   const dialog = h(
     "dialog",

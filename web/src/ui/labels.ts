@@ -159,7 +159,8 @@ function factsRow(viewer: Viewer, title: string, name: string, color: string): R
     setText(level, now.level);
     const name = nameOf(viewer.settings.quality);
     setText(quality, formatSsim(now.promised));
-    quality.title = `promised ${name} ${formatSsim(now.promised)}, expected ${formatSsim(now.expected)}; ${MEANING[now.trust]}`;
+    const meaning = now.missing ? "no promise: not all of it is drawn" : MEANING[now.trust];
+    quality.title = `promised ${name} ${formatSsim(now.promised)}, expected ${formatSsim(now.expected)}; ${meaning}`;
     const place = now.visible ? formatDistance(now.distance * metres) : "out of sight";
     const remark = now.visible ? REMARK[now.trust] : "";
     const size = `${formatCount(now.count)} · ${formatBytes(now.bytes)}`;

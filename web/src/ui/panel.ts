@@ -1,9 +1,10 @@
+import { leastPromise } from "../core/describe";
 import { qualitiesOf } from "../core/manifest";
 import type { Quality, Settings } from "../types";
 import { isTyping } from "../view/controls";
 import { DEFAULT_TARGETS, type Viewer } from "../view/viewer";
 import { h, iconButton, setText } from "./dom";
-import { formatBytes, formatCount, formatSsim, nameOf } from "./format";
+import { formatBytes, formatCount, formatScreens, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
 
 const MODES: readonly (readonly [Settings["mode"], string])[] = [
@@ -19,6 +20,7 @@ export class Panel {
   readonly #table: LabelTable;
   readonly #summary = h("span", { class: "summary" });
   readonly #meter = h("div", { class: "meter" }, h("i"));
+  readonly #screens = h("p", { class: "screens" });
   readonly #facts = h("dl", { class: "facts" });
   readonly #sliders: Control[];
   readonly #modes: HTMLButtonElement[];
@@ -56,6 +58,7 @@ export class Panel {
           ...this.#modes,
         ),
         ...others.map(({ element }) => element),
+        this.#screens,
         this.#facts,
         this.#table.element,
       ),
@@ -76,11 +79,13 @@ export class Panel {
     const { state, settings, streamer, frameMs } = this.viewer;
     const { totals } = streamer.manifest; // grows while training runs
     const bytes = `${formatBytes(state.bytesShown)} of ${formatBytes(totals.bytes)}`;
-    const promised = state.labels.filter(({ visible }) => visible).map((label) => label.promised);
-    const least = Math.min(...promised.filter(Number.isFinite));
+    const drawn = state.labels.filter(({ visible, label }) => visible && !this.viewer.isHidden(label.id));
+    const least = leastPromise(drawn);
     const quality = nameOf(settings.quality);
     setText(this.#summary, Number.isFinite(least) ? `${bytes} · ${quality} ≥ ${formatSsim(least)}` : bytes);
     this.#summary.title = `Size of what is shown, and the least ${quality} promised of what is in sight; 1 is no difference`;
+    const { height } = this.viewer.stage.canvas;
+    setText(this.#screens, state.screens ? formatScreens(state.screens, height) : "");
     this.#meter.style.setProperty("--value", String(state.bytesShown / Math.max(totals.bytes, 1)));
     for (const button of this.#modes) {
       const chosen = button.dataset.mode === settings.mode;

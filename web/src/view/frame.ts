@@ -31,8 +31,9 @@ export function transformPose(pose: Pose, matrix: Matrix4): Pose {
  * @param root - the bundle's frame to world
  * @param camera - camera to world
  * @param projection - camera to clip space; its near plane is ignored, since near content is visible
+ * @param focal - pixels (`focalOf`)
  */
-export function viewpoint(root: Matrix4, camera: Matrix4, projection: Matrix4): Viewpoint {
+export function viewpoint(root: Matrix4, camera: Matrix4, projection: Matrix4, focal: number): Viewpoint {
   const inverse = root.clone().invert();
   const toBundle = inverse.multiply(camera);
   const direction = new Vector3(0, 0, -1).transformDirection(toBundle);
@@ -48,7 +49,13 @@ export function viewpoint(root: Matrix4, camera: Matrix4, projection: Matrix4): 
     position: vec3(new Vector3().setFromMatrixPosition(toBundle)),
     direction: vec3(direction),
     frustum: planes,
+    focal,
   };
+}
+
+/** The focal length of a projection onto so many pixels, the geometric mean of both axes'. */
+export function focalOf({ elements }: Matrix4, width: number, height: number): number {
+  return Math.sqrt(Math.abs((elements[0] ?? 0) * (elements[5] ?? 0)) * width * height) / 2;
 }
 
 function plane(axis: number[], w: number[], sign: number): [number, number, number, number] {

@@ -9,7 +9,7 @@ import {
 } from "three";
 import type { Ray } from "../core/pick";
 import type { Camera, Manifest, Pose, Viewpoint } from "../types";
-import { lens, quat, rootMatrix, transformPose, vec3, viewpoint } from "./frame";
+import { focalOf, lens, quat, rootMatrix, transformPose, vec3, viewpoint } from "./frame";
 import { orientation, type Rig } from "./motion";
 import { SparkLayer } from "./spark";
 
@@ -78,6 +78,7 @@ export class Stage {
     this.renderer.setSize(width, height, false);
     this.project();
     this.draw(); // resizing clears the canvas
+    this.invalidate(); // the plan for the new picture comes with the next frame
   }
 
   /** The camera's viewpoint in the bundle's frame. */
@@ -103,8 +104,18 @@ export class Stage {
   }
 
   viewpoint(): Viewpoint {
-    this.camera.updateMatrixWorld();
-    return viewpoint(this.root, this.camera.matrixWorld, this.camera.projectionMatrix);
+    const { camera, root } = this;
+    camera.updateMatrixWorld();
+    return viewpoint(root, camera.matrixWorld, camera.projectionMatrix, this.#focal());
+  }
+
+  /** Focal length in pixels of what is drawn: of the canvas, in a headset of one eye's picture. */
+  #focal(): number {
+    const { xr } = this.renderer;
+    const eye = xr.isPresenting ? xr.getCamera().cameras[0] : undefined; // none before the first frame
+    if (eye) return focalOf(eye.projectionMatrix, eye.viewport.z, eye.viewport.w);
+    const { x, y } = this.renderer.getDrawingBufferSize(new Vector2());
+    return focalOf(this.camera.projectionMatrix, x, y);
   }
 
   /** Frees the GPU, also what the browser keeps for the canvas. */

@@ -1,6 +1,7 @@
 /** Links that break and files that are broken: named, and the rest lives on. */
 
 import { expect, test } from "vitest";
+import { leastPromise } from "../../src/core/describe";
 import type { Fault } from "../simulate";
 import { shown, world } from "../world";
 
@@ -42,6 +43,47 @@ test("a first level that is broken leaves its label away", async () => {
   expect(shown(w.streamer.state)).toEqual([4, 4, 0]);
   expect(w.streamer.state.status).toBe("ok");
   expect(w.streamer.state.message).toContain("label 2 cannot be shown");
+});
+
+test("nothing is promised for what is missing, and of what is drawn no more than it keeps", async () => {
+  const { w, file } = made();
+  const first = w.manifest.labels[0]?.levels[0]?.uri ?? "";
+  w.network.faults.set(first, ["offline", "offline"]);
+  w.network.faults.set(file, 404); // level 3 of label 1
+  const least = () => leastPromise(w.streamer.state.labels);
+  w.streamer.start();
+  let missing = 0;
+  for (let i = 0; i < 200; i++) {
+    await w.pass(20);
+    for (const { shown, promised } of w.streamer.state.labels) {
+      if (!shown) expect(promised).toBeNaN();
+    }
+    const [a, ...others] = w.streamer.state.labels;
+    if (!a?.shown && others.every(({ shown }) => shown)) {
+      missing += 1;
+      expect(least()).toBeNaN();
+      expect(leastPromise(others)).toBeGreaterThan(0);
+    }
+  }
+  expect(missing).toBeGreaterThan(0);
+  await w.rest();
+  const [, capped] = w.streamer.state.labels;
+  expect(shown(w.streamer.state)).toEqual([4, 2, 4]);
+  expect(least()).toBe(capped?.promised);
+  await w.run({ mode: "base" });
+  const [, lower] = w.streamer.state.labels;
+  expect(lower?.promised).toBeLessThan(capped?.promised ?? 0);
+});
+
+test("a label without a promise lends none but in full, where it is as the full scene", async () => {
+  const w = world({ labels: 2, levels: 3 });
+  await w.run({ mode: "full" });
+  const [known, other] = w.streamer.state.labels;
+  if (!known || !other) throw new Error("no labels");
+  expect(leastPromise([known, { ...other, promised: Number.NaN }])).toBe(known.promised);
+  expect(leastPromise([known, { ...other, promised: Number.NaN, shown: 2 }])).toBeNaN();
+  expect(leastPromise([{ ...known, promised: Number.NaN }])).toBeNaN();
+  expect(leastPromise([])).toBeNaN();
 });
 
 test("a file that cannot be decoded caps its label", async () => {

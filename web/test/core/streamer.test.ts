@@ -5,7 +5,7 @@ import { digestOfBrowser } from "../../src/core/download";
 import type { Camera } from "../../src/types";
 import { type Network, settled } from "../simulate";
 import { shown, type World, wanted, world } from "../world";
-import { at, bundle, frustumOf, NO_BUDGET, rightOf, totals } from "../worlds";
+import { at, bundle, FOCAL, frustumOf, NO_BUDGET, rightOf, totals } from "../worlds";
 
 const chunks = (paths: readonly string[]) => paths.filter((path) => path.startsWith("chunks/"));
 const twice = (paths: readonly string[]) => paths.filter((path, i) => paths.indexOf(path) < i);
@@ -349,6 +349,26 @@ test("changing the state inside a callback does no harm", async () => {
   expect(calls).toBeGreaterThan(5);
 });
 
+test("another screen is another viewpoint: promises are those of its sharpness", async () => {
+  const w = world({ labels: 3, levels: 5 });
+  expect(w.streamer.state.screens).toBeNull();
+  await w.run({ mode: "full" });
+  expect(w.streamer.state.screens).toEqual({ least: 0.5, most: 2, here: 1 });
+  const expected = () => w.streamer.state.labels.map((label) => label.expected);
+  const see = async (focal?: number) => {
+    w.streamer.update({ ...at(0), ...(focal && { focal }) });
+    await w.pass(500);
+    return expected();
+  };
+  const photos = await see();
+  expect(await see(FOCAL)).toEqual(photos);
+  const sharper = await see(2 * FOCAL);
+  expect(sharper).not.toEqual(photos);
+  expect(w.streamer.state.screens?.here).toBe(2);
+  expect(await see(3 * FOCAL)).toEqual(sharper);
+  expect(w.streamer.state.screens?.here).toBe(3);
+});
+
 test("a window higher than the photos knows their distances, as the models do", async () => {
   const made = world({ labels: 1, levels: 2 });
   const [label] = made.manifest.labels;
@@ -356,7 +376,7 @@ test("a window higher than the photos knows their distances, as the models do", 
   const ground = Array.from({ length: 20 }, (_, i) => [-4, -1.6, -i - 1, 4, -1.5, -i] as const);
   const labels = [{ ...label, boxes: ground }];
   const phone = { ...at(0), frustum: frustumOf([0, 0, 0], [0, 0, 0, 1], 2 * Math.atan(1.2), 0.46) };
-  const camera = { width: 400, height: 300, intrinsics: [400, 400, 200, 150] } as unknown as Camera;
+  const camera = { width: 400, height: 300, intrinsics: [700, 700, 200, 150] } as unknown as Camera;
   const distances: number[] = [];
   for (const cameras of [[], [camera]]) {
     const w = world({}, { manifest: { ...made.manifest, labels, cameras } }, made);

@@ -14,6 +14,7 @@ interface PromiseCase {
   viewpoints: {
     position: Vec3;
     direction: Vec3;
+    focal: number | null;
     distance: number | null;
     corrected: number | null;
     mean: number[];
@@ -69,7 +70,9 @@ describe("promises", () => {
       const model = new ViewModel(label, new Views(c.promises), own);
       const ofLevels = (values: readonly number[]) => own.levels.map((k) => values[k - 1] ?? Number.NaN);
       for (const v of c.viewpoints) {
-        const told = model.predict(v.distance ?? Number.NaN, v.position, v.direction);
+        const { position, direction, focal } = v;
+        const from = { position, direction, ...(focal !== null && { focal }) };
+        const told = model.predict(v.distance ?? Number.NaN, from);
         near(ofLevels(told.mean), v.mean);
         v.bound.forEach((value, k) => {
           if (value === null) expect(ofLevels(told.bound)[k]).toBeNaN();
@@ -78,7 +81,7 @@ describe("promises", () => {
         near([told.support], [v.support]);
         const outside = v.support < own.leastSupport;
         expect(told.trust).toBe(outside ? "outside" : own.targets.length ? own.status : "unknown");
-        const right = model.corrected(v.distance ?? Number.NaN, v.position, v.direction);
+        const right = model.corrected(v.distance ?? Number.NaN, from);
         if (v.corrected === null) expect(right).toBeNaN();
         else near([right], [v.corrected], 1);
         label.levels.forEach((_, k) => {
@@ -121,9 +124,32 @@ test("a frustum that is no wider than the photos is that of the window", () => {
   expect(photoFrustum(window, [0.6, 0.6])).toBe(window.frustum);
   expect(photoFrustum(window, null)).toBe(window.frustum);
   expect(photoFrustum({ ...window, frustum: [] }, [0.1, 0.1])).toEqual([]);
+});
+
+test("the lens is that of the photos, and of other shapes of their area", () => {
   expect(widestLens([])).toBeNull();
-  const camera = { width: 200, height: 100, intrinsics: [100, 125, 90, 50] } as unknown as Camera;
-  expect(widestLens([camera, { ...camera, width: 100 }])).toEqual([1, 0.4]);
+  const long = { width: 300, height: 40, intrinsics: [100, 160, 150, 20] } as unknown as Camera;
+  const shaped = Math.sqrt((300 * 40 * 20) / 9) / (2 * Math.sqrt(100 * 160)); // of the long one
+  near(widestLens([long, { ...long, width: 30 }]) ?? [], [1.5, shaped]);
+  const square = { ...long, width: 100, height: 100, intrinsics: [100, 100, 50, 50] } as const;
+  const half = Math.sqrt(20 / 9) / 2;
+  near(widestLens([square]) ?? [], [half, half]);
+});
+
+test("screens beyond those that are known count as the nearer end, none as the photos'", () => {
+  const { promises } = (JSON.parse(promised) as { cases: PromiseCase[] }).cases[5] ?? {};
+  const own = promises?.labels[0];
+  if (!own) throw new Error("no case");
+  const model = new ViewModel(labelWith(5), new Views(promises), own);
+  const at = (screen?: number) => {
+    const focal = screen === undefined ? {} : { focal: screen * promises.focal };
+    return model.predict(2, { position: [0, 0, 0], direction: [0, 0, -1], ...focal });
+  };
+  expect(promises.screens).toEqual([0.5, 2]);
+  expect(at(9)).toEqual(at(2));
+  expect(at(0.01)).toEqual(at(0.5));
+  expect(at()).toEqual(at(1));
+  expect(at(2).mean).not.toEqual(at(1).mean);
 });
 
 const curve: Curve = {
@@ -166,10 +192,10 @@ test("shares of pixels come from the views near by", () => {
   if (!own?.promises.labels[0]) throw new Error("no case");
   const count = own.promises.views[0]?.length ?? 0;
   const shares = differences(Array.from({ length: count }, (_, i) => (i === 3 ? 5000 : 1000)));
-  const entry = { ...own.promises.labels[0], shares, lengths: [0.01, 0.01, 1] as const };
+  const entry = { ...own.promises.labels[0], shares, lengths: [0.01, 0.01, 1, 1] as const };
   const views = new Views(own.promises);
   const model = new ViewModel(labelWith(6), views, entry);
-  const [x, y, z, a, b, c] = [...views.rows.slice(18, 24)] as [
+  const [x, y, z, a, b, c] = [...views.rows.slice(21, 27)] as [
     number,
     number,
     number,
@@ -178,6 +204,9 @@ test("shares of pixels come from the views near by", () => {
     number,
   ];
   const { extent } = own.promises;
-  expect(model.share([x * extent, y * extent, z * extent], [a, b, c])).toBeCloseTo(0.5, 6);
-  expect(model.share([1e4, 0, 0], [0, 0, 1])).toBeCloseTo(0.1 + 0.4 / count, 9);
+  const there = [x * extent, y * extent, z * extent] as const;
+  for (const focal of [1, 1e4]) // of place alone
+    expect(model.share({ position: there, direction: [a, b, c], focal })).toBeCloseTo(0.5, 6);
+  const away = model.share({ position: [1e4, 0, 0], direction: [0, 0, 1] });
+  expect(away).toBeCloseTo(0.1 + 0.4 / count, 9);
 });

@@ -1,7 +1,7 @@
 import { Matrix4, PerspectiveCamera, Vector3 } from "three";
 import { expect, test } from "vitest";
 import type { Camera, Manifest } from "../../src/types";
-import { lens, rootMatrix, transformPose, viewpoint } from "../../src/view/frame";
+import { focalOf, lens, rootMatrix, transformPose, viewpoint } from "../../src/view/frame";
 
 const frame: Manifest["frame"] = {
   axes: "rub",
@@ -34,8 +34,14 @@ test("the frustum holds what is in the picture, as near as can be", () => {
   camera.position.set(1, 2, 3);
   camera.lookAt(0, 1, 0);
   camera.updateMatrixWorld();
-  const { frustum, position, direction } = viewpoint(root, camera.matrixWorld, camera.projectionMatrix);
+  const { frustum, position, direction, focal } = viewpoint(
+    root,
+    camera.matrixWorld,
+    camera.projectionMatrix,
+    700,
+  );
   expect(new Vector3(...direction).length()).toBeCloseTo(1, 9);
+  expect(focal).toBe(700);
   const inside = (point: Vector3) =>
     frustum.every(([x, y, z, d]) => x * point.x + y * point.y + z * point.z + d >= 0);
   const toBundle = new Matrix4().copy(root).invert();
@@ -48,18 +54,28 @@ test("the frustum holds what is in the picture, as near as can be", () => {
   expect(inside(near)).toBe(true);
 });
 
+const photo: Camera = {
+  name: "a",
+  split: "train",
+  position: [0, 0, 0],
+  quaternion: [0, 0, 0, 1],
+  fovY: 1,
+  width: 320,
+  height: 200,
+  intrinsics: [230, 225, 155, 104],
+};
+
 test("a photo's lens keeps its principal point on any canvas of its height", () => {
-  const photo: Camera = {
-    name: "a",
-    split: "train",
-    position: [0, 0, 0],
-    quaternion: [0, 0, 0, 1],
-    fovY: 1,
-    width: 320,
-    height: 200,
-    intrinsics: [230, 225, 155, 104],
-  };
   expect(lens(photo, 320, 200)).toEqual([-155 / 230, 165 / 230, 104 / 225, -96 / 225]);
+  const [left, right, top, bottom] = lens(photo, 640, 400);
+  const projection = new Matrix4().makePerspective(left, right, top, bottom, 1, 2);
+  // the photo's own focal length, on twice its height; and that of a field of view
+  expect(focalOf(projection, 640, 400)).toBeCloseTo(2 * Math.sqrt(230 * 225), 9);
+  const { projectionMatrix } = new PerspectiveCamera(90, 16 / 9, 0.1, 100);
+  expect(focalOf(projectionMatrix, 1600, 900)).toBeCloseTo(450, 9);
+});
+
+test("a photo's lens is wider on a wider canvas", () => {
   const [left, right] = lens(photo, 640, 200);
   expect(right - left).toBeCloseTo(640 / 230, 9);
 });

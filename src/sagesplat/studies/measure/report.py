@@ -14,13 +14,15 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.io.files import write_json
+from sagesplat.metrics.flip import PIXELS_PER_DEGREE
 from sagesplat.output.figures import ACCENT, FAINT, STYLE, save_figure, shortened
 from sagesplat.output.table import Table
 from sagesplat.output.tables import MB, mean
-from sagesplat.studies.measure.score import COVERED, Row
+from sagesplat.studies.measure.score import COVERED, FLIP, Row
 
 JSON, PICTURE = "measure.json", "measure"
 SIDE = 192  # px, of the crops
+FLIP_NOTE = f"FLIP: 0 is no difference to be seen at {PIXELS_PER_DEGREE:g} pixels per degree"
 _COLOURS = (ACCENT, "#1d4ed8", "#047857", "#7c3aed", "#b45309", "#be185d")
 _WIDTH = 12.0  # inches
 
@@ -37,7 +39,7 @@ class Measured:
     nbytes: Sequence[int]
     views: Sequence[str]  # names of the viewpoints
     categories: Mapping[int, str]
-    nets: Sequence[str]  # columns of LPIPS
+    others: Sequence[str]  # columns of MS-SSIM, FLIP and LPIPS, as far as they were measured
     rows: Sequence[Row]
 
     def of(self, level: int, label_id: int) -> list[Row]:
@@ -66,15 +68,16 @@ def levels_table(measured: Measured) -> Table:
         worst = min(whole, key=lambda row: row.ssim)
         cells = [name, measured.counts[level], measured.counts[level] / max(1, measured.reference_count)]
         cells += [measured.nbytes[level] / MB]
-        cells += [_of_field(whole, field) for field in ("ssim", "psnr", *measured.nets)]
+        cells += [_of_field(whole, field) for field in ("ssim", "psnr", *measured.others)]
         cells += [_mean(covered, "ssim"), _mean(covered, "psnr"), worst.ssim, measured.views[worst.view]]
         body.append(tuple(cells))
-    header = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.nets)
+    header = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.others)
     header += ("SSIM covered", "PSNR covered", "worst SSIM", "at")
-    formats = ("", ",d", ".1%", ".2f", ".4f", ".2f", *[".4f"] * len(measured.nets), ".4f", ".2f", ".4f", "")
+    formats = ("", ",d", ".1%", ".2f", ".4f", ".2f", *[".4f"] * len(measured.others), ".4f", ".2f", ".4f", "")
     title = f"Levels against {measured.reference}, means over {len(measured.views)} viewpoints"
     note = "covered: pixels that the reference covers; an empty background agrees with itself"
-    return Table(title, header, formats, body, notes=(note,))
+    notes = (note, *([FLIP_NOTE] if FLIP in measured.others else []))
+    return Table(title, header, formats, body, notes=notes)
 
 
 def categories_table(measured: Measured) -> Table:
@@ -96,11 +99,11 @@ def regions_table(measured: Measured) -> Table:
             if rows := measured.of(level, label):
                 cells: list[Any] = [name, measured.counts[level], measured.nbytes[level]]
                 cells += [measured.region(label), len(rows)]
-                cells += [_of_field(rows, field) for field in ("ssim", "psnr", *measured.nets)]
+                cells += [_of_field(rows, field) for field in ("ssim", "psnr", *measured.others)]
                 body.append((*cells, min(row.ssim for row in rows)))
-    header = ("level", "Gaussians", "bytes", "region", "viewpoints", "SSIM", "PSNR", *measured.nets)
+    header = ("level", "Gaussians", "bytes", "region", "viewpoints", "SSIM", "PSNR", *measured.others)
     header += ("worst SSIM",)
-    formats = ("", "d", "d", "", "d", *[".4f"] * (len(measured.nets) + 3))
+    formats = ("", "d", "d", "", "d", *[".4f"] * (len(measured.others) + 3))
     return Table("Levels by region", header, formats, body)
 
 
@@ -109,12 +112,14 @@ def views_table(measured: Measured) -> Table:
     body = [
         (
             measured.names[row.level], measured.views[row.view], measured.region(row.label_id), row.pixels,
-            row.ssim, row.psnr, *(row.lpips.get(net, np.nan) for net in measured.nets),
+            row.ssim, row.psnr, *(row.others.get(name, np.nan) for name in measured.others),
         )
         for row in measured.rows
     ]  # fmt: skip
-    header = ("level", "viewpoint", "region", "pixels", "SSIM", "PSNR", *measured.nets)
-    return Table("Levels by viewpoint", header, ("", "", "", "d", *[".4f"] * (2 + len(measured.nets))), body)
+    header = ("level", "viewpoint", "region", "pixels", "SSIM", "PSNR", *measured.others)
+    return Table(
+        "Levels by viewpoint", header, ("", "", "", "d", *[".4f"] * (2 + len(measured.others))), body
+    )
 
 
 def write_report(folder: Path, measured: Measured, how: Mapping[str, Any], strip: "Strip") -> None:
@@ -162,7 +167,7 @@ def _figure(measured: Measured, strip: Strip) -> Figure:
     per_row = 8
     pictures = [("reference", strip.reference), *zip(measured.names, strip.levels, strict=True)]
     rows = -(-len(pictures) // per_row)
-    fields = ["ssim", "psnr", *measured.nets]
+    fields = ["ssim", "psnr", *(name for name in measured.others if name.startswith("lpips"))]
     cell = _WIDTH / per_row
     height = 6.2 + rows * (cell + 0.25) + 0.4
     figure = Figure(figsize=(_WIDTH, height))
@@ -210,7 +215,7 @@ def _curves(axes: Axes, measured: Measured, sizes: np.ndarray, field: str) -> No
 
 
 def _of_field(rows: Sequence[Row], field: str) -> float:
-    """Mean of SSIM, PSNR or LPIPS by a network; NaN without any."""
+    """Mean of SSIM, PSNR or another column; NaN without any."""
     if field in ("ssim", "psnr"):
         return _mean(rows, field)
-    return mean(np.array([row.lpips.get(field, np.nan) for row in rows]))
+    return mean(np.array([row.others.get(field, np.nan) for row in rows]))

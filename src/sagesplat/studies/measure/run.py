@@ -13,6 +13,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageStarted, Warned
 from sagesplat.formats.splats import Splat
 from sagesplat.io.typed import check_limits
+from sagesplat.metrics import flip
 from sagesplat.metrics.image import ssim_map
 from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.raster import Backend
@@ -29,7 +30,7 @@ from sagesplat.studies.measure.report import (
     worst_view,
     write_report,
 )
-from sagesplat.studies.measure.score import Renderer, compare
+from sagesplat.studies.measure.score import FLIP, MS_SSIM, Renderer, compare
 
 
 def measure(
@@ -56,14 +57,17 @@ def measure(
             f"{config.cameras}: no camera has {reference.name} in sight; give cameras of this scene"
         )
     metrics = load_metrics(emit, config.lpips)
+    if (no_flip := flip.missing()) is not None:
+        emit(Warned(f"no FLIP: {no_flip}"))
 
     def done(images: int) -> None:
         emit(Progress("measure", images, total))
 
-    rows, counts = compare(truth, levels, cameras, metrics, renderer, done)
+    rows, counts = compare(truth, levels, cameras, metrics, renderer, done, no_flip is None)
     measured = Measured(
         reference.name, len(truth.gaussians), names, [level.series for level in levels], counts,
-        [level.nbytes for level in levels], views, truth.names, list(metrics), rows,
+        [level.nbytes for level in levels], views, truth.names,
+        [MS_SSIM, *([] if no_flip else [FLIP]), *metrics], rows,
     )  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
     up = np.mean([-camera.w2c[1, :3] for camera in cameras], axis=0)
@@ -128,7 +132,7 @@ def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, ren
 
 
 def _show(measured: Measured, emit: Emit) -> None:
-    columns = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.nets, "SSIM covered")
+    columns = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.others, "SSIM covered")
     emit(levels_table(measured).only(*columns, "worst SSIM").event)
     if measured.labels():
         emit(categories_table(measured).event)

@@ -11,13 +11,16 @@ from jaxtyping import Float32, Int16
 from sagesplat.adapt.observe import TOTAL, RenderedLabels, render_rgb
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.splats import Splat
+from sagesplat.metrics.flip import flip_map
 from sagesplat.metrics.image import means_by_label, psnr, squared_error_map, ssim_map
 from sagesplat.metrics.lpips import Lpips
+from sagesplat.metrics.ms_ssim import ms_ssim
 from sagesplat.raster import Backend, Workspace, device_of, rasterize
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.studies.measure.levels import Level
 
+MS_SSIM, FLIP = "MS-SSIM", "FLIP"  # columns
 COVERED = -4  # label id of the pixels that the reference covers: an empty background agrees with itself
 LEAST_SHARE = 0.001  # of a view's pixels; a category with fewer is not measured there
 _OPAQUE = 0.5
@@ -34,7 +37,7 @@ class Row:
     ssim: float
     psnr: float  # dB
     pixels: int
-    lpips: Mapping[str, float]  # by network; of the whole image only
+    others: Mapping[str, float]  # MS-SSIM, FLIP and LPIPS by column; of the whole image only
 
 
 class Renderer:
@@ -66,11 +69,12 @@ def compare(
     metrics: Mapping[str, Lpips],
     renderer: Renderer,
     done: Callable[[int], None],
+    flip: bool = False,
 ) -> tuple[list[Row], list[int]]:
     """Measure levels in all viewpoints: the measurements, and the number of Gaussians of each level.
 
     The labels of `reference` say where the categories are; `metrics`: LPIPS by column; `done` hears how many
-    images were compared.
+    images were compared; `flip`: measure FLIP as well.
     """
     rows: list[Row] = []
     counts: list[int] = []
@@ -85,8 +89,12 @@ def compare(
             seen = {name: metric.features(truth) for name, metric in metrics.items()}
             for number, splat in enumerate(splats, begin):
                 image = renderer.rgb(splat, camera)
-                lpips = {n: metric.distance(metric.features(image), seen[n]) for n, metric in metrics.items()}
-                rows += _rows(number, view, image, truth, covered, ids, lpips)
+                others = {MS_SSIM: ms_ssim(image, truth)}
+                others |= {FLIP: float(flip_map(image, truth).mean())} if flip else {}
+                others |= {
+                    n: metric.distance(metric.features(image), seen[n]) for n, metric in metrics.items()
+                }
+                rows += _rows(number, view, image, truth, covered, ids, others)
                 images += 1
                 done(images)
     return rows, counts
@@ -120,10 +128,10 @@ def _rows(
     truth: Float32[np.ndarray, "H W 3"],
     covered: np.ndarray,
     ids: Int16[np.ndarray, "H W"] | None,
-    lpips: Mapping[str, float],
+    others: Mapping[str, float],
 ) -> list[Row]:
     quality, error = ssim_map(image, truth), squared_error_map(image, truth)
-    found = [Row(number, view, TOTAL, float(quality.mean()), float(psnr(error.mean())), quality.size, lpips)]
+    found = [Row(number, view, TOTAL, float(quality.mean()), float(psnr(error.mean())), quality.size, others)]
     regions = [np.where(covered, COVERED, UNLABELLED).astype(np.int16), *([] if ids is None else [ids])]
     for region in regions:
         errors = means_by_label(error, region)
