@@ -17,10 +17,10 @@ from sagesplat.adapt.eq1 import plan_scene
 from sagesplat.adapt.eq3 import fit_models
 from sagesplat.adapt.evaluate import QUALITIES, UNIFORM, Evaluation, read_evaluation
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
-from sagesplat.adapt.plan import Plan, Reached
+from sagesplat.adapt.plan import Choice, Plan, Reached
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.io.columns import cell_text
-from sagesplat.output import figures
+from sagesplat.output import figures, report_figures
 from sagesplat.output.by_category import merged
 from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands, next_steps
@@ -254,7 +254,7 @@ def whole_page() -> ReportData:
     draw = np.random.default_rng(1)
     directions = draw.normal(size=(VIEWS, 2))
     place = Place(draw.normal(size=(300, 2)), draw.random((300, 3)), 3 * directions, -directions)
-    drawn = {label: np.sort(draw.random((12, len(LEVELS))), axis=1).astype(np.float32) for label in LABELS}
+    drawn = {label: np.sort(draw.random((10, len(LEVELS))), axis=1).astype(np.float32) for label in LABELS}
     return dataclasses.replace(
         led_by_fidelity(panels=2),
         commands=Commands("'/runs/a place'", "/photos", 1000),
@@ -262,6 +262,8 @@ def whole_page() -> ReportData:
         links=[("Its bundle", "../../bundle/index.html"), ("The paper's tables", "paper/index.html")],
         place=place,
         drawn=drawn,
+        drawn_at=Place(place.points, place.colours, place.at[:10], place.towards[:10]),
+        looks=[(0.9, np.full((8, 12, 3), 90, np.uint8)), (1.0, np.full((8, 12, 3), 99, np.uint8))],
         promise=PromiseFacts(0.95, 57, 27, 83, "screens of 0.5 to 2 times the photos' focal length"),
         settings=[("train.max_steps", "1000")],
         provenance=[("sha256 of scene.json", "f" * 64)],
@@ -472,3 +474,29 @@ def test_pixels_that_are_ignored_are_grey_in_the_error_and_explained(written, tm
     assert said not in written[2].text
     data = dataclasses.replace(data, panels=[dataclasses.replace(panel, valid=valid)])
     assert said in Page(write_report(tmp_path, data)).text
+
+
+def test_what_promises_are_for_and_what_fidelity_looks_like(whole):
+    words = " ".join(Page(whole).text.split())
+    assert "Promises are for screens of 0.5 to 2 times the photos' focal length." in words
+    looks = words[words.index("What fidelity looks like") : words.index("What the promises rest on")]
+    assert looks.endswith("0.90 full model ")
+    assert (whole.parent / "figures" / "viewpoints.svg").exists()
+
+
+def test_the_map_of_viewpoints_counts_what_reaches_the_target():
+    """Two categories; the second viewpoint shows one of them, the third none."""
+    nan = np.nan
+    plan = Plan(
+        0.9,
+        None,
+        (Choice(3, 2, nan, nan, 5, "ok"), Choice(7, 1, nan, nan, 5, "ok")),
+        0.95,
+        quality="fidelity",
+    )
+    drawn = {
+        3: np.array([[0.8, 0.95], [0.8, 0.85], [nan, nan]], np.float32),
+        7: np.array([[0.8, 0.95], [nan, nan], [nan, nan]], np.float32),
+    }
+    data = dataclasses.replace(whole_page(), drawn=drawn)
+    np.testing.assert_array_equal(report_figures._reached(data, plan), [0.5, 0.0, nan])

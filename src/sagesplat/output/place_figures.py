@@ -40,6 +40,32 @@ def camera_map(
 
     Those of `test` views have a ring, and `worst` a note: beside it more photos help most.
     """
+    figure = _from_above(place, quality, test, "SSIM of the full model in this photo")
+    axes = figure.axes[0]
+    if worst is not None:
+        axes.annotate(
+            "more photos from here", place.at[worst], (0, 16), textcoords="offset points", ha="center",
+            fontsize=10, fontweight="bold", color=ACCENT, zorder=5,
+            arrowprops={"arrowstyle": "-", "color": ACCENT},
+            bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.85},
+        )  # fmt: skip
+    handles = [_camera(INK, 9, "test photo (unseen)"), _camera("white", 7, "training photo")]
+    axes.legend(
+        handles=handles if test.any() else handles[1:], loc="lower left", framealpha=0.85, frameon=True
+    )
+    return figure
+
+
+@rc_context(STYLE)
+def viewpoint_map(place: Place, share: Float[np.ndarray, " V"]) -> Figure:
+    """Drawn viewpoints from above, coloured by the share of their categories that reach the target."""
+    return _from_above(place, share, np.zeros(len(share), bool), "categories that reach the target here")
+
+
+def _from_above(
+    place: Place, values: Float[np.ndarray, " V"], ringed: Bool[np.ndarray, " V"], says: str
+) -> Figure:
+    """Points and cameras from above, these coloured by values (NaN: none), with their directions."""
     low, high = _window(place)
     size = high - low
     height = float(np.clip(_MAP_WIDTH * size[1] / size[0], *_MAP_HEIGHTS))
@@ -49,28 +75,17 @@ def camera_map(
     axes.scatter(*place.points[some].T, s=4, c=place.colours[some], linewidths=0, rasterized=True)
     ends = place.at + _ARROW * size[0] * place.towards
     axes.plot(*np.stack([place.at, ends], axis=1).transpose(2, 1, 0), color=INK, lw=0.8, zorder=3)
-    known = np.isfinite(quality)
-    limits = np.quantile(quality[known], [0.0, 1.0]) if known.any() else np.array([0.0, 1.0])
-    for rows, ring, dot in ((~test, "white", 42), (test, INK, 90)):
+    known = np.isfinite(values)
+    limits = np.quantile(values[known], [0.0, 1.0]) if known.any() else np.array([0.0, 1.0])
+    for rows, ring, dot in ((~ringed, "white", 42), (ringed, INK, 90)):
         dots = axes.scatter(
-            *place.at[rows].T, s=dot, c=quality[rows], cmap="RdYlBu", vmin=limits[0], vmax=limits[1],
+            *place.at[rows].T, s=dot, c=values[rows], cmap="RdYlBu", vmin=limits[0], vmax=limits[1],
             edgecolors=ring, linewidths=1.6 if ring == INK else 0.6, zorder=4, plotnonfinite=True,
         )  # fmt: skip
     if known.any():
-        figure.colorbar(dots, ax=axes, label="SSIM of the full model in this photo", shrink=0.8, pad=0.01)
-    if worst is not None:
-        axes.annotate(
-            "more photos from here", place.at[worst], (0, 16), textcoords="offset points", ha="center",
-            fontsize=10, fontweight="bold", color=ACCENT, zorder=5,
-            arrowprops={"arrowstyle": "-", "color": ACCENT},
-            bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.85},
-        )  # fmt: skip
+        figure.colorbar(dots, ax=axes, label=says, shrink=0.8, pad=0.01)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="world units")
     axes.grid(visible=False)
-    handles = [_camera(INK, 9, "test photo (unseen)"), _camera("white", 7, "training photo")]
-    axes.legend(
-        handles=handles if test.any() else handles[1:], loc="lower left", framealpha=0.85, frameon=True
-    )
     return figure
 
 
@@ -100,10 +115,11 @@ def fidelity_by_size(
     names: Mapping[int, str],
     colours: Colours,
 ) -> Figure:
-    """Fidelity of each category over the bytes of its levels, at the V viewpoints that show it; a panel each.
+    """Fidelity of each category over the bytes of its levels, at the viewpoints that show it; a panel each.
 
     `labels`: the largest first, of which the first nine are drawn; `plan`: whose levels are marked.
     """
+    drawn = {label: values[np.isfinite(values).all(1)] for label, values in drawn.items()}
     shown = [label for label in labels if label in drawn and len(drawn[label])][:_SHOWN]
     columns = max(1, min(3, len(shown)))
     figure, grid = panel_grid(len(shown), columns, (3.2, 2.1), 0.6, sharey=True)
@@ -121,7 +137,7 @@ def fidelity_by_size(
             at = bytes_of(choice) / 1e3
             axes.plot(at, promised, "o", ms=9, mfc="none", mec=ACCENT, mew=2, clip_on=False, zorder=4)
         axes.set_title(caption(label, names), loc="left", color=colour, fontweight="bold")
-        axes.set_ylim(max(0.0, float(min(d[:, 0].min() for d in drawn.values())) - 0.05), 1.02)
+        axes.set_ylim(max(0.0, float(min(drawn[one][:, 0].min() for one in shown)) - 0.05), 1.02)
     figure.supxlabel("kB to send, level by level", fontsize=9)
     figure.supylabel("fidelity", fontsize=9)
     handles = [

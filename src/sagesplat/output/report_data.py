@@ -69,7 +69,9 @@ class ReportData:
     place: Place | None = None  # the capture from above
     promise: PromiseFacts | None = None
     drawn: Mapping[int, Float32[np.ndarray, "V K"]] = field(default_factory=dict)
-    """Fidelity by label id: of each level, at the drawn viewpoints that show the category."""
+    """Fidelity by label id: of each level, at drawn viewpoints; NaN where one shows too little of it."""
+    drawn_at: Place | None = None  # those viewpoints from above
+    looks: Sequence[tuple[float, UInt8[np.ndarray, "h w 3"]]] = ()  # fidelity, part of a picture
 
 
 def main_plan(data: ReportData) -> Plan:

@@ -3,10 +3,11 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from sagesplat.adapt.evaluate import Evaluation
 from sagesplat.adapt.observe import TOTAL
-from sagesplat.adapt.plan import quality_title
+from sagesplat.adapt.plan import Plan, quality_title
 from sagesplat.output import figures, place_figures, tables
 from sagesplat.output.next_steps import view_quality, worst_view
 from sagesplat.output.place_figures import Place
@@ -38,6 +39,9 @@ def report_figures(
                 data.drawn, levels, data.sizes, main_plan(data), labels, names, colours
             ),
         )
+    if data.drawn and data.drawn_at is not None:
+        share = _reached(data, main_plan(data))
+        yield "viewpoints", "Map of the drawn viewpoints", place_figures.viewpoint_map(data.drawn_at, share)
     if len(data.evaluation):
         yield (
             "quality_over_size",
@@ -82,6 +86,15 @@ def _uniform(data: ReportData) -> dict[int, float]:
     rows = data.observations.select(np.isin(data.observations.view, data.test_views))
     levels = [level for level in np.unique(rows.level).tolist() if level not in data.recovering]
     return {level: tables.view_mean(rows, TOTAL, level) for level in levels}
+
+
+def _reached(data: ReportData, plan: Plan) -> Float[np.ndarray, " V"]:
+    """Share of the categories that reach the target at each drawn viewpoint, at the plan's levels."""
+    levels = plan.levels
+    measured = np.stack([values[:, levels[i] - 1] for i, values in data.drawn.items() if i in levels], 1)
+    known = np.isfinite(measured)
+    counts = known.sum(1)
+    return np.where(counts > 0, (known & (measured >= plan.target)).sum(1) / np.maximum(counts, 1), np.nan)
 
 
 def _camera_map(data: ReportData, place: Place) -> figures.Figure:

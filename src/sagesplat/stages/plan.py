@@ -63,13 +63,7 @@ def show_plan(job: Job) -> None:
         plans.append(scene_plan(job, "ssim", ssim))
     for plan in plans:
         table = plan_table(plan, job.ladder.counts, titles(job.names()))
-        columns = (
-            "category",
-            "level",
-            "Gaussians",
-            "of full model",
-            f"promised {quality_title(plan.quality)}",
-        )
+        columns = ("category", "level", "Gaussians", "of full model")
         counted = plan.budget is None and method_of(job).streams
         reached = ("reached in", "from", "to", "views") if counted else ()
         job.emit(table.only(*columns, *reached, "status").event)

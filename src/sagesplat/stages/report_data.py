@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from sagesplat import __version__
 from sagesplat.adapt.free_poses import level_axes
@@ -20,6 +21,7 @@ from sagesplat.adapt.viewpoints import SETS, in_words
 from sagesplat.core.config import LadderKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.pictures import open_picture
+from sagesplat.metrics.image import ssim_map
 from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands
 from sagesplat.output.place_figures import Place
@@ -30,6 +32,7 @@ from sagesplat.run.records import read_record, settings_of, uses
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage_table import STAGES, needed_for
 from sagesplat.scene import describe
+from sagesplat.scene.scene import Camera
 from sagesplat.segment.block_categories import category_of
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED
@@ -47,6 +50,8 @@ from sagesplat.stages.results import (
 from sagesplat.stages.shared import label_colors
 from sagesplat.viewer.frames import FLIP, upward
 
+_LOOKS = (0.8, 0.9, 0.95, 0.98)
+_PART = 3  # of the sides of a view
 PANELS = 3  # views shown in pictures
 
 
@@ -65,6 +70,7 @@ def report_data(
     run, scene, masks, ladder = job.run, job.scene, job.level_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
     promise, drawn = _promise(job)
+    sets = viewpoints_of(job) if promise else None
     beside = settings_of(run, "plan")["target_ssim"] if quality == "fidelity" else None
     records = {path.stem: read_record(path) for path in stage_records(run)}
     return ReportData(
@@ -99,9 +105,11 @@ def report_data(
         can_view=method_of(job).streams,
         links=links(run),
         url=url,
-        place=_place(job),
+        place=_place(job, [view.camera for view in scene.views]),
         promise=promise,
         drawn=drawn,
+        drawn_at=_place(job, [sets.cameras[row] for row in sets.rows("fit")]) if sets else None,
+        looks=_looks(job) if sets else (),
     )
 
 
@@ -177,11 +185,10 @@ def links(run: RunDir) -> list[tuple[str, str]]:
     return [(title, os.path.relpath(path, run.report)) for title, path in found if path.is_file()]
 
 
-def _place(job: Job) -> Place:
-    """The capture from above."""
+def _place(job: Job, cameras: Sequence[Camera]) -> Place:
+    """The capture from above, and cameras."""
     scene = job.scene
-    cameras = [view.camera for view in scene.views]
-    plane = np.stack(level_axes(upward(cameras) * FLIP), axis=1)
+    plane = np.stack(level_axes(upward([view.camera for view in scene.views]) * FLIP), axis=1)
     return Place(
         points=scene.points.xyz @ plane,
         colours=scene.points.rgb / 255,
@@ -200,8 +207,38 @@ def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
     fitted, composed, calibration = (len(sets.rows(name)) for name in SETS)
     facts = PromiseFacts(confidence, fitted, composed, calibration, in_words(sets))
     shown = sampled.shown()
-    drawn = {label: sampled.fidelity[shown[:, column], column] for column, label in enumerate(sampled.labels)}
-    return facts, {label: values for label, values in drawn.items() if len(values)}
+    drawn = {
+        label: np.where(shown[:, column, None], sampled.fidelity[:, column], np.float32(np.nan))
+        for column, label in enumerate(sampled.labels)
+        if shown[:, column].any()
+    }
+    return facts, drawn
+
+
+def _looks(job: Job) -> list[tuple[float, np.ndarray]]:
+    """What fidelities look like: the part of a view with most detail, at the levels that measure nearest to
+    `_LOOKS` in that part, ascending; last the full model's.
+    """
+    scene, ladder = job.scene, job.ladder
+    camera = scene.views[int((*scene.test_ids, *scene.train_ids)[0])].camera.neutral
+    images = [
+        render_rgb(ladder.load(level), camera, backend=job.backend, antialiased=job.antialiased)
+        for level in ladder.levels
+    ]
+    size = [max(1, side // _PART) for side in images[-1].shape[:2]]
+    grey = images[-1].mean(2)
+    detail = uniform_filter(grey**2, size) - uniform_filter(grey, size) ** 2
+    inside = tuple(
+        slice(side // 2, full - side + side // 2 + 1) for side, full in zip(size, grey.shape, strict=True)
+    )
+    corner = np.unravel_index(int(detail[inside].argmax()), detail[inside].shape)
+    part = tuple(slice(int(at), int(at) + side) for at, side in zip(corner, size, strict=True))
+    measured = [float(ssim_map(image, images[-1])[part].mean()) for image in images[:-1]]
+    rows = sorted({int(np.abs(np.array(measured) - one).argmin()) for one in _LOOKS}) if measured else []
+    found = [(value, images[row]) for row, value in zip(rows, np.take(measured, rows).tolist(), strict=True)]
+    return [
+        (value, np.round(255 * image[part]).astype(np.uint8)) for value, image in (*found, (1.0, images[-1]))
+    ]
 
 
 def picture_panels(job: Job, composed: Gaussians) -> list[Panel]:
