@@ -68,7 +68,7 @@ $(CORE): pyproject.toml constraints.txt
 	touch $@
 
 $(INSTALLED): $(CORE)
-	$(INSTALL) '.[dev,docs,onnx,hf,poses,video,heic,view,ray]'
+	$(INSTALL) '.[dev,docs,onnx,hf,poses,video,heic,view,ray,flip]'
 	touch $@
 
 .PHONY: docs gallery

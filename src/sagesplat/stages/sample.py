@@ -31,8 +31,8 @@ from sagesplat.stages.methods import method_of
 
 VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.1  # at least this share
-DEFAULT_COUNTS = {"fit": VIEWS[1], "bias": 60, "calibration": 180}  # as many as the training's time allows;
-MOST = {"fit": VIEWS[-1], "bias": 60, "calibration": 300}  # after a long training up to these, by
+DEFAULT_COUNTS = {"fit": VIEWS[1], "bias": 90, "calibration": 150}  # as many as the training's time allows;
+MOST = {"fit": VIEWS[-1], "bias": 90, "calibration": 300}  # after a long training up to these, by
 _EXTRA = 0.25  # this share of its time: they make bounds a little tighter, no more
 _RENDERS = 2.5  # a training step: a render takes about a quarter of it (demo: 0.6 of the training's time)
 _SEED = 0  # of the draws
