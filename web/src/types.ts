@@ -91,7 +91,7 @@ export interface LabelState {
   readonly error: string | null;
   readonly visible: boolean; // in the frustum
   readonly distance: number; // NaN: unknown
-  readonly promised: number; // the promise: lower confidence bound of quality of what is drawn; NaN: none
+  readonly promised: number; // quality of what is drawn that 95 of 100 such views have, at most the target; NaN: none
   readonly expected: number; // mean quality at the shown level
   readonly trust: Trust; // in the promise
   readonly count: number; // splats shown

@@ -90,8 +90,8 @@ def _uniform(data: ReportData) -> dict[int, float]:
 
 def _reached(data: ReportData, plan: Plan) -> Float[np.ndarray, " V"]:
     """Share of the categories that reach the target at each drawn viewpoint, at the plan's levels."""
-    levels = plan.levels
-    measured = np.stack([values[:, levels[i] - 1] for i, values in data.drawn.items() if i in levels], 1)
+    levels, at = sorted({level for _, level in data.counts}), plan.levels
+    measured = np.stack([v[:, levels.index(at[i])] for i, v in data.drawn.items() if i in at], 1)
     known = np.isfinite(measured)
     counts = known.sum(1)
     return np.where(counts > 0, (known & (measured >= plan.target)).sum(1) / np.maximum(counts, 1), np.nan)

@@ -12,6 +12,7 @@ export interface Overview {
   readonly pending: number;
   readonly leavingBytes: number; // GPU bytes of removed labels that are still drawn
   readonly screens: Screens | null;
+  readonly asked: number; // quality that the levels were chosen for; Infinity: for none
   readonly notes: readonly (string | null | undefined)[]; // most important first
   failure(entry: Entry, level: number): Failure | undefined;
 }
@@ -47,8 +48,9 @@ function labelState(entry: Entry, overview: Overview): LabelState {
     error: errorOf(entry, overview),
     visible: sight.visible,
     distance: sight.distance,
-    // the prediction is of the new content, and nothing is known of one that is not drawn
-    promised: (former ? undefined : prediction.bound[level - 1]) ?? Number.NaN,
+    // the prediction is of the new content, and nothing is known of one that is not drawn; what was calibrated is
+    // the choice for a target: more than the target is not promised
+    promised: Math.min((former ? undefined : prediction.bound[level - 1]) ?? Number.NaN, overview.asked),
     expected: (former ? undefined : prediction.mean[level - 1]) ?? Number.NaN,
     trust: prediction.trust,
     count: ladder.count[level - 1] ?? 0,

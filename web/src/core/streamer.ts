@@ -424,6 +424,7 @@ export class Streamer {
       pending: this.pending,
       leavingBytes: this.leaving.reduce((sum, drawn) => sum + gpuBytesOf(drawn), 0),
       screens: this.screens(),
+      asked: this.settings.mode === "target" ? this.settings.target : Infinity,
       notes: [
         this.trouble,
         this.downloads.note,
