@@ -21,14 +21,17 @@ LINES = {
 # A command in the place of sagesplat's: what it does is the program's first argument. `told()` returns once
 # the test has sent its signals. Whether signals are the same wish does not depend on the clock.
 PROGRAM = """
-import sys, types
+import sys, time, types
 from pathlib import Path
 from sagesplat.__main__ import program
 
 def main():
     def ready():
         print("ready", flush=True)
-    exec(sys.argv[1], {"ready": ready, "told": sys.stdin.read, "folder": Path(sys.argv[2])})
+    def rest():  # Python does not see a signal that comes just before a sleep begins until it is over
+        while True:
+            time.sleep(0.05)
+    exec(sys.argv[1], {"ready": ready, "rest": rest, "told": sys.stdin.read, "folder": Path(sys.argv[2])})
 
 sys.modules["sagesplat.cli"] = types.SimpleNamespace(main=main)
 program()
@@ -43,7 +46,7 @@ with locked(folder), atomic_path(folder / "a.txt") as path:
     path.write_text("half")
     try:
         ready()
-        time.sleep(3600)
+        rest()
     finally:
         ready()
         told()
@@ -125,10 +128,9 @@ def test_a_program_that_hangs_at_its_end_can_still_be_ended(tmp_path: Path) -> N
     "code",
     [
         # a callback of the garbage collector, which drops exceptions
-        "class Slow:\n    def __del__(self):\n        ready()\n        time.sleep(3600)\n"
-        "import time\nSlow()\ntime.sleep(3600)",
+        "class Slow:\n    def __del__(self):\n        ready()\n        rest()\nSlow()\nrest()",
         # Python ends itself by SIGINT where a plain KeyboardInterrupt passed through an `exec`
-        "exec('ready(); import time; time.sleep(3600)', globals())",
+        "exec('ready(); rest()', globals())",
     ],
 )
 def test_no_signal_goes_astray(tmp_path: Path, code: str) -> None:
@@ -148,7 +150,7 @@ with deferred():
     told()  # the test reads one line at a time
     print("begun", flush=True)
     signal.signal(signal.SIGTERM, lambda *_: exit(9))  # as libraries do
-time.sleep(3600)
+rest()
 """
 
 
@@ -195,7 +197,7 @@ def test_what_nohup_and_shells_ignore_stays_ignored(tmp_path: Path) -> None:
 
 def test_imports_are_interrupted_in_one_line_too(tmp_path: Path) -> None:
     """The first module that the command line imports says when."""
-    (tmp_path / "tyro.py").write_text("import time; print('ready', flush=True); time.sleep(3600)")
+    (tmp_path / "tyro.py").write_text("import time\nprint('ready', flush=True)\nwhile True: time.sleep(0.05)")
     here = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *map(str, sys.path)])}
     with subprocess.Popen(
         [sys.executable, "-m", "sagesplat", "info", "."],
