@@ -99,7 +99,7 @@ def test_images_of_the_full_model_take_bounded_memory(capture, monkeypatch):
 
 def test_too_little_of_a_category_is_not_measured(capture, monkeypatch):
     assert np.isfinite(measured(capture).fidelity).all()
-    monkeypatch.setattr(sys.modules[module.__name__], "MIN_SHARE", 0.9)
+    monkeypatch.setattr(sys.modules[module.__name__], "PROMISED_SHARE", 0.9)
     table = measured(capture)
     parts = table.select((table.label_id != TOTAL) & (table.label_id != UNIFORM))
     assert np.isnan(parts.fidelity).all()

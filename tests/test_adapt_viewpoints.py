@@ -119,6 +119,13 @@ def test_screens_and_places_that_cannot_be(rule, says):
         draw(SCENE, capture_cameras(SCENE), rule, {"fit": 1})
 
 
+def test_pictures_that_are_too_large_are_one_line_and_its_cure_works():
+    photo = replace(SCENE.views[1].camera, width=4000, height=3000)
+    with pytest.raises(RunError, match=r"screens 0\.5 50: pictures of 30,000 mega.*; end at 4\.72 or below$"):
+        draw(SCENE, [photo], Rule(screens=(0.5, 50.0)), {"fit": 1})
+    assert len(draw(SCENE, [photo], Rule(screens=(0.5, 4.72)), {"fit": 3}).cameras) == 3
+
+
 def test_screens_are_log_uniform_and_keep_the_field_of_view_or_the_area():
     cameras = orbit(12)
     drawn = draw(scene(cameras), cameras, Rule(screens=(0.5, 2.0)), {"fit": 400}).cameras

@@ -501,3 +501,19 @@ def test_the_map_of_viewpoints_counts_what_reaches_the_target():
     }
     data = dataclasses.replace(whole_page(), drawn=drawn, counts={(3, 1): 2, (3, 2): 5, (7, 1): 2, (7, 2): 5})
     np.testing.assert_array_equal(report_figures._reached(data, plan), [0.5, 0.0, nan])
+    others = dataclasses.replace(plan, choices=())
+    np.testing.assert_array_equal(report_figures._reached(data, others), [nan, nan, nan])
+
+
+def test_long_names_have_legends_too(tmp_path):
+    data = led_by_fidelity(panels=1)
+    names = dict.fromkeys(data.names, "a category whose name is longer than most of them are")
+    assert write_report(tmp_path, dataclasses.replace(data, names=names)).exists()
+
+
+def test_the_map_of_viewpoints_of_a_scene_in_blocks(tmp_path):
+    """A category's rows are those of all its blocks; the map has a dot for each viewpoint."""
+    page = whole_page()
+    first, *others = page.drawn
+    data = dataclasses.replace(page, categories=dict.fromkeys(others, first))
+    assert (write_report(tmp_path, data).parent / "figures" / "viewpoints.svg").exists()

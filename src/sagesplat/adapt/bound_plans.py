@@ -64,10 +64,11 @@ def quality_at(
     shape = len(cameras), *costs.count.shape
     mean, bound, far = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape[:2], np.nan)
     calibrated = np.zeros(len(costs.labels), bool)
+    at = where(cameras, next((model.focal for model in promises.values()), 1.0))  # one for all of a quality
     for i, label in enumerate(costs.labels):
         far[:, i] = distances.get(label, far[:, i])
         if label in promises:
-            predicted = promises[label].predict(far[:, i], *where(cameras, promises[label].focal))
+            predicted = promises[label].predict(far[:, i], *at)
             known = np.array(promises[label].levels) - 1
             mean[:, i, known], bound[:, i, known] = predicted.mean, predicted.bound
             calibrated[i] = promises[label].status == "calibrated"

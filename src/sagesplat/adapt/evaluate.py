@@ -12,9 +12,9 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float32, Int16, Int32
 
+from sagesplat.adapt.fidelity import PROMISED_SHARE
 from sagesplat.adapt.ladder import Ladder
 from sagesplat.adapt.observe import (
-    MIN_SHARE,
     TOTAL,
     LabelImages,
     RenderedLabels,
@@ -159,7 +159,7 @@ def evaluate(
             else:
                 reference = kept[row]
             image = reference if g is last else render(g, neutral)
-            least = MIN_SHARE * image.shape[0] * image.shape[1]
+            least = PROMISED_SHARE * image.shape[0] * image.shape[1]
             fidelity = fidelity_by_label(image, reference, labels[view], least)
             colours = measure_colours(image, photo, valid[view])
             if view.camera.exposure is not None:

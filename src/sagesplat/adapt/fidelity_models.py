@@ -27,9 +27,8 @@ from sagesplat.adapt.calibrate import (
     fewest_views,
 )
 from sagesplat.adapt.fidelity import SampledFidelity
-from sagesplat.adapt.process import fit_process, matern32
+from sagesplat.adapt.process import fit_process, inputs_of, matern32
 from sagesplat.adapt.viewpoint import (
-    NO_CALIBRATION,
     Calibration,
     Status,
     ViewModel,
@@ -74,6 +73,7 @@ def fit_fidelity(
     Returns:
         Models by label id; a category that is shown in no viewpoint has none. They are not calibrated yet.
     """
+    position, direction, screen = where(cameras, focal)
     shown, models = sampled.shown(), {}
     for column, label in enumerate(sampled.labels):
         rows = np.flatnonzero(shown[:, column])
@@ -83,24 +83,27 @@ def fit_fidelity(
         distance = sampled.distance[rows, column].astype(np.float64)
         known = np.log(distance[distance > 0])
         median = float(np.median(known)) if len(known) else 0.0
-        unfitted = ViewModel(
-            label_id=label, quality="fidelity", curves=(), extent=extent, median_log_distance=median,
-            focal=focal, screens=screens, inputs=np.zeros((0, 8)), heldout_inputs=np.zeros(len(rows), bool),
-            lengths=(1.0, 1.0, 1.0, 1.0), heldout_variance=0.0, weights=np.zeros(values.shape), rmse=0.0,
-            calibration=NO_CALIBRATION,
-        )  # fmt: skip
-        x = unfitted.inputs_at(distance, *where([cameras[row] for row in rows], focal))
-        models[label] = _fit(unfitted, x, values, confidence)
+        inside = np.clip(screen[rows], *screens)
+        x = inputs_of(distance, position[rows], direction[rows], extent, median, inside)
+        models[label] = _fit(label, x, values, extent, median, confidence, focal, screens)
     return models
 
 
 def _fit(
-    unfitted: ViewModel, x: Float[np.ndarray, "n 8"], values: Float[np.ndarray, "n K"], confidence: float
+    label: int,
+    x: Float[np.ndarray, "n 8"],
+    values: Float[np.ndarray, "n K"],
+    extent: float,
+    median: float,
+    confidence: float,
+    focal: float,
+    screens: tuple[float, float],
 ) -> ViewModel:
+    photos = np.zeros(len(x), bool)
     mean = values.mean(0)
     # the last level is the reference: known, and no part of the process (unless it is the only one)
     learnt = slice(0, max(len(mean) - 1, 1))
-    process = fit_process(x, unfitted.heldout_inputs, (values - mean)[:, learnt])
+    process = fit_process(x, photos, (values - mean)[:, learnt])
     weights = np.zeros(values.shape)
     weights[:, learnt] = process.weights
     left_out = values.copy()
@@ -118,14 +121,21 @@ def _fit(
         ],
         *_MARGINS,
     )
-    return replace(
-        unfitted,
+    return ViewModel(
+        label_id=label,
+        quality="fidelity",
         curves=tuple(
-            constant_curve(unfitted.label_id, k, float(m), float(e), len(x))
+            constant_curve(label, k, float(m), float(e), len(x))
             for k, m, e in zip(range(1, len(mean) + 1), mean, rmse, strict=True)
         ),
+        extent=extent,
+        median_log_distance=median,
+        focal=focal,
+        screens=screens,
         inputs=x,
+        heldout_inputs=photos,
         lengths=process.lengths,
+        heldout_variance=0.0,
         weights=weights,
         rmse=float(rmse.mean()),
         calibration=_calibration(TARGETS + CERTAIN * margins, margins, "uncalibrated", confidence, 0, least),

@@ -59,7 +59,7 @@ def _van_der_corput(numbers: np.ndarray, base: int) -> np.ndarray:
     return found
 
 
-def _looking(position: np.ndarray, direction: np.ndarray, up: np.ndarray) -> Float64[np.ndarray, "4 4"]:
+def looking(position: np.ndarray, direction: np.ndarray, up: np.ndarray) -> Float64[np.ndarray, "4 4"]:
     """World-to-camera of a camera without roll."""
     z = direction / np.linalg.norm(direction)
     x = np.cross(z, up)
@@ -114,12 +114,12 @@ class Orbits:
                 target = self.centre + max(0.1, 1 - factor) * self.parts[int(part * len(self.parts))]
                 away = sine * self.up + np.sqrt(1 - sine**2) * level
                 position = self.centre + factor * self._fitting(away) * away
-                yield _looking(position, target - position, self.up)
+                yield looking(position, target - position, self.up)
             start += _BATCH
 
     def _fitting(self, away: np.ndarray) -> float:
         """The distance from the centre at which most parts are in the frame, seen from a direction."""
-        axes = _looking(away, -away, self.up)[:3, :3]
+        axes = looking(away, -away, self.up)[:3, :3]
         local = self.parts @ axes.T
         needed = ((np.abs(local[:, :2]) + self.thickness[:, None]) * self.frame).max(1) - local[:, 2]
         return max(float(np.quantile(needed, _FRAMED)), self.thickness.max(), 1e-6)
@@ -149,7 +149,7 @@ class Standing:
             for row in np.flatnonzero(stands & (blur <= self.sharp)):
                 direction = self._direction(detail[row], *drawn[row, [0, 4]])
                 if np.median(detail[row][RAYS @ direction > self.cosine]) > np.exp(-self.sharp - _BLUR):
-                    yield _looking(points[row], direction, self.up)
+                    yield looking(points[row], direction, self.up)
 
     def _facts(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Blur [P], detail [P, rays], and whether one can stand there [P]."""

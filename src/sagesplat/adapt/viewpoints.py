@@ -21,23 +21,23 @@ All draws are independent of each other, so those that nothing is fitted to are 
 visitor who moves as the rule says.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float64
 from msgspec import Meta
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
+from sagesplat.adapt.free_poses import looking
 from sagesplat.core.errors import RunError
 from sagesplat.core.limits import Count, Positive, Screen, Seed, Share
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.typed import check_limits, convert_as, read_json_as, refused
-from sagesplat.scene.cameras import VIEWPOINTS, ViewpointsFile
-from sagesplat.scene.loading import MAX_SIDE
+from sagesplat.scene.cameras import MOST_PIXELS, VIEWPOINTS, ViewpointsFile
 from sagesplat.scene.nerfstudio import Poses
 from sagesplat.scene.scene import Camera, Scene
 
@@ -103,6 +103,13 @@ def draw(
         RunError: For a rule that cannot be followed.
     """
     check_rule(rule)
+    pixels, (low, high) = max(camera.width * camera.height for camera in base), rule.screens
+    if pixels * high**2 > MOST_PIXELS:
+        most = math.floor(100 * math.sqrt(MOST_PIXELS / pixels)) / 100
+        raise RunError(
+            f"--sample.screens {low:g} {high:g}: pictures of {pixels * high**2 / 1e6:,.0f} megapixels, and "
+            f"at most {MOST_PIXELS / 1e6:,.0f} are drawn; end at {most:g} or below"
+        )
     sampler = _Sampler(scene, base, rule)
     cameras, sets = [], []
     for name, count in counts.items():
@@ -206,7 +213,8 @@ class _Sampler:
         height = self.position[one] @ self.up + self.extent * rng.uniform(-_RISE, _RISE)
         position += self.up * (height - position @ self.up)
         ahead = self.inner[int(rng.integers(len(self.inner)))] - position
-        return level(ahead, self.up), position, _CLEAR * float(np.quantile(self.free, _CROWDED))
+        rotation = looking(position, ahead, self.up)[:3, :3].T
+        return rotation, position, _CLEAR * float(np.quantile(self.free, _CROWDED))
 
     def _depth(self, one: int) -> float:
         """Median depth of the points before a camera; the extent where there are none."""
@@ -220,22 +228,12 @@ class _Sampler:
         size = np.array([camera.width, camera.height])
         side = float(np.sqrt(size.prod()))
         new = np.array([side * ratio**0.5, side * ratio**-0.5]) if shaped else size
-        new = np.clip(np.round(s * new), 1, MAX_SIDE).astype(int)
+        new = np.maximum(np.round(s * new), 1).astype(int)
         K = camera.K.astype(np.float64)
         K[:2] *= s
         if shaped:
             K[:2, 2] = new / 2
         return replace(camera, K=K.astype(np.float32), width=int(new[0]), height=int(new[1]))
-
-
-def level(ahead: Float64[np.ndarray, "3"], up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Camera to world of one that looks ahead without roll."""
-    z = ahead / max(np.linalg.norm(ahead), 1e-12)
-    x = np.cross(-up, z)
-    if np.linalg.norm(x) < 1e-6:
-        x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 def write_viewpoints(path: Path, drawn: Viewpoints) -> None:

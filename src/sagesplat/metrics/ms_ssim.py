@@ -7,13 +7,8 @@ from scipy.ndimage import correlate1d
 from sagesplat.metrics import ssim_cpu
 from sagesplat.metrics.image import ssim_planes
 
-WEIGHTS = (
-    0.0448,
-    0.2856,
-    0.3001,
-    0.2363,
-    0.1333,
-)  # of the scales, the finest first: the paper's, section 3.2
+# of the scales, the finest first: the paper's, section 3.2
+WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _C1 = 0.01**2
 
 

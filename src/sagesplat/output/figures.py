@@ -296,7 +296,7 @@ def asked_and_measured(
     axes.text(ends[1], ends[0], "target missed ", ha="right", va="bottom", color=FAINT)
     named = quality_title(quality)
     axes.set(xlabel=f"{named} asked for", ylabel=f"measured {named}", xlim=ends, ylim=ends)
-    columns = _columns(3, 0, labels, names)
+    columns = _columns(3, 2, labels, names)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=7.5)
     return figure
 

@@ -262,7 +262,7 @@ def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mappi
         header += (f"{model}plain PSNR", f"{model}cc_ssim", f"{model}cc_psnr")
         formats += (".2f", ".3f", ".2f")
     header, formats = (*header, "MS-SSIM", "full model MS-SSIM"), (*formats, ".3f", ".3f")
-    return Table("Bound against measurement, unseen views", header, formats, body)
+    return Table("Promised and measured, unseen views", header, formats, body)
 
 
 def models_table(models: Mapping[tuple[int, int], SsimModel], names: Mapping[int, str]) -> Table:
