@@ -105,6 +105,7 @@ def open_page(
     browser: "Browser | None" = None,
     scheme: Literal["light", "dark"] = "light",
     touch: bool = False,
+    ratio: float = 1.0,
     script: str = "",
     network: tuple[float, float] | None = None,
     wait: Literal["commit", "load"] = "load",
@@ -117,18 +118,20 @@ def open_page(
         browser: one that runs (default: starts one for this page).
         scheme: the colours that the user prefers.
         touch: a phone: touches instead of a mouse.
+        ratio: pixels of the screen per pixel of the window.
         script: JavaScript that runs before the page's own.
         network: Mbit/s and milliseconds to emulate from the first request on.
         wait: for the page's files, or only until it has begun.
     """
     if browser is None:
         with launch() as own, open_page(
-            url, size, browser=own, scheme=scheme, touch=touch, script=script, network=network, wait=wait
+            url, size, browser=own, scheme=scheme, touch=touch, ratio=ratio, script=script, network=network,
+            wait=wait,
         ) as opened:  # fmt: skip
             yield opened
         return
     context = browser.new_context(
-        viewport={"width": size[0], "height": size[1]}, device_scale_factor=1, color_scheme=scheme,
+        viewport={"width": size[0], "height": size[1]}, device_scale_factor=ratio, color_scheme=scheme,
         has_touch=touch, ignore_https_errors=True,
     )  # fmt: skip
     context.set_default_timeout(LIMIT)

@@ -117,10 +117,17 @@ def model(
         heldout_inputs=(np.arange(views) % 5 == 2) & unseen & (quality == "ssim"),
         lengths=tuple(rng.uniform(0.2, 1.2, 4).tolist()),  # pyright: ignore[reportArgumentType]
         heldout_variance=float(rng.uniform(0, 0.4)) * unseen,
+        photos=_photos(seed, 5 * (quality == "fidelity")),
         weights=rng.normal(0, 0.05, (views, len(levels))) * last,
         rmse=0.03,
         calibration=calibration(quality),
     )
+
+
+def _photos(seed: int, count: int) -> np.ndarray:
+    rng = np.random.default_rng(100 + seed)
+    direction = rng.normal(size=(3, count))
+    return np.concatenate([rng.normal(0, 0.7, (3, count)), direction / np.linalg.norm(direction, axis=0)])
 
 
 def calibration(quality: QualityKind) -> Calibration:

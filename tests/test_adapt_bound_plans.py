@@ -32,7 +32,7 @@ def model(label: int, calibration: Calibration = NO_CALIBRATION) -> ViewModel:
     x = np.array([[0, 0, 0, 0, 0, 1, 0, 0]], float)
     return ViewModel(
         label, "fidelity", curves, 1.0, 0.0, FOCAL, (0.5, 2.0), x, np.zeros(1, bool), (1.0, 1.0, 1.0, 1.0),
-        0.0, np.zeros((1, 3)), 0.0, calibration,
+        0.0, np.zeros((6, 0)), np.zeros((1, 3)), 0.0, calibration,
     )  # fmt: skip
 
 

@@ -8,16 +8,18 @@ import pytest
 
 from sagesplat.adapt.fidelity import SampledFidelity, read_sampled, write_sampled
 from sagesplat.adapt.fidelity_models import (
+    MOST_PHOTOS,
     NOMINAL,
     TARGETS,
     Trial,
     calibrated,
     fit_fidelity,
     hold_all_categories,
+    photo_places,
     plan_nominal,
     remove_composition_bias,
 )
-from sagesplat.adapt.viewpoint import Calibration, read_promises, write_promises
+from sagesplat.adapt.viewpoint import Calibration, away_from, read_promises, where, write_promises
 from sagesplat.core.errors import DataError
 from sagesplat.scene.scene import Camera
 
@@ -76,7 +78,7 @@ def trial(models, cameras: list[Camera], seed: int, spill: float = 0.0, shown=No
 
 def made(seed: int, confidence: float = 0.95, spill: float = 0.0, views=(80, 60, 120)):
     fit, bias, calibration = (viewpoints(n, 10 * seed + i) for i, n in enumerate(views))
-    models = fit_fidelity(sampled(fit, seed), fit, 2.0, confidence, 1.0, (0.5, 2.0))
+    models = fit_fidelity(sampled(fit, seed), fit, 2.0, confidence, 1.0, (0.5, 2.0), fit)
     for _ in range(2):
         models = remove_composition_bias(models, trial(models, bias, 100 * seed, spill), confidence)
     models, held = hold_all_categories(models, trial(models, bias, 100 * seed, spill), confidence)
@@ -173,7 +175,7 @@ def test_a_category_that_is_never_shown_has_no_model():
     table = sampled(cameras, 0)
     pixels = table.pixels.copy()
     pixels[:, 1] = 0
-    models = fit_fidelity(replace(table, pixels=pixels), cameras, 2.0, 0.95, 1.0, (0.5, 2.0))
+    models = fit_fidelity(replace(table, pixels=pixels), cameras, 2.0, 0.95, 1.0, (0.5, 2.0), cameras)
     assert set(models) == {3}
     planned = plan_nominal(models, LABELS, K, np.full((30, 2), np.nan, np.float32), cameras, NOMINAL)
     assert (planned[..., 1] == K).all()
@@ -182,10 +184,10 @@ def test_a_category_that_is_never_shown_has_no_model():
 def test_one_viewpoint_and_one_level():
     cameras = viewpoints(1, 0)
     table = sampled(cameras, 0)
-    models = fit_fidelity(table, cameras, 2.0, 0.95, 1.0, (0.5, 2.0))
+    models = fit_fidelity(table, cameras, 2.0, 0.95, 1.0, (0.5, 2.0), cameras)
     assert np.isfinite(models[3].weights).all()
     single = replace(table, fidelity=table.fidelity[..., -1:], whole=table.whole[:, -1:])
-    one = fit_fidelity(single, cameras, 2.0, 0.95, 1.0, (0.5, 2.0))[3]
+    one = fit_fidelity(single, cameras, 2.0, 0.95, 1.0, (0.5, 2.0), cameras)[3]
     position = np.zeros((1, 3))
     assert one.predict(np.array([np.nan]), position, np.array([[0.0, 0, 1]])).bound.tolist() == [[1.0]]
 
@@ -230,3 +232,18 @@ def test_targets_between_those_that_are_calibrated():
     np.testing.assert_allclose(found, [0.2, 0.4, 0.4, 0.6, 0.65, 0.7], atol=1e-6)
     assert (np.diff(TARGETS) > 0).all()
     assert set(NOMINAL[NOMINAL < 0.9]) <= set(TARGETS)
+
+
+def test_photos_of_a_large_capture_are_thinned_and_still_cover_it():
+    cameras = viewpoints(600, 3)
+    places = photo_places(cameras, 2.0)
+    assert places.shape == (6, MOST_PHOTOS)
+    every = np.column_stack([places.T, np.zeros((MOST_PHOTOS, 2))])
+    known = {tuple(np.round(row, 6)) for row in photo_places(cameras[:MOST_PHOTOS], 2.0).T}
+    assert len(known) == MOST_PHOTOS  # none is left out of so many
+    at = where(cameras, 1.0)
+    x = np.column_stack([at.position / 2.0, at.direction, np.zeros((600, 2))])
+    thinned = away_from(x, places)
+    some = away_from(x, places[:, ::8])
+    assert thinned.max() < 0.5 * some.max()
+    assert (away_from(every, places) < 1e-9).all()

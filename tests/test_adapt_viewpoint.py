@@ -84,6 +84,23 @@ def test_less_is_said_away_from_what_is_known(model):
     np.testing.assert_allclose(predicted.mean[-1], [c(float(distance[0])) for c in model.curves], atol=0.05)
 
 
+def test_thresholds_rise_away_from_the_photos_where_they_are_known(model):
+    distance, position, direction = viewpoints(SCENE, SCENE.train_ids[:1])
+    place = np.concatenate([position[0] / model.extent, direction[0]])
+    steep = replace(model, calibration=replace(CALIBRATION, slopes=np.full(3, 0.1), least_support=0.0))
+    near = replace(steep, photos=np.column_stack([place + 9, place]))
+    path = position + np.array([0, 0.03, 0.3])[:, None] * model.extent * np.array([0.6, 0.0, 0.8])
+    one = near.predict(np.repeat(distance, 3), path, np.repeat(direction, 3, 0))
+    # Matern 3/2 of 0, 0.1 and 1 length scales
+    scaled = np.sqrt(3) * np.array([0, 0.1, 1])
+    np.testing.assert_allclose(one.away, 1 - (1 + scaled) * np.exp(-scaled), atol=1e-9)
+    far = replace(steep, photos=np.column_stack([place + 9]))
+    other = far.predict(np.repeat(distance, 3), path, np.repeat(direction, 3, 0))
+    np.testing.assert_allclose(other.away, 1, atol=1e-6)
+    assert (other.bound[:, 0] < one.bound[:, 0]).all()
+    np.testing.assert_array_equal(other.mean, one.mean)
+
+
 def test_the_bound_of_a_mean_by_hand():
     means = np.array([[0.5, 0.62, 0.685, 0.81, 0.99]])
     plain = replace(CALIBRATION, slopes=np.zeros(3))

@@ -165,6 +165,8 @@ export interface Promises {
   screens: [number, number];
   /** By axis (x y z over the extent, direction, log screen) and view, in 1/10000. */
   views: [Steps, Steps, Steps, Steps, Steps, Steps, Steps];
+  /** Photos that thresholds rise away from, as views without a screen. None: the views of a label. */
+  photos: [Steps, Steps, Steps, Steps, Steps, Steps];
   labels: LabelPromises[];
 }
 /** The viewpoint model of a label. */

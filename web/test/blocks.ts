@@ -100,6 +100,7 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
     focal: FOCAL,
     screens: [0.5, 2],
     views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6)],
+    photos: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) => {
       const [x = 0, , z = 0] = label.boxes[0] ?? [];
       const away = all.map((view) => Math.hypot(view[0] - x, view[2] - z));

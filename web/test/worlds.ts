@@ -230,6 +230,7 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
     focal: FOCAL,
     screens: [0.5, 2],
     views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6)],
+    photos: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) => ({
       ...modelOf(label, rows, random),
       shares: differences(rows.map(() => (10_000 * random()) / labels.length)),

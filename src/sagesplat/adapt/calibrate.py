@@ -10,8 +10,8 @@ Views are the unit: those of one capture are drawn independently, the categories
 category has its own thresholds, and each target has its own. With fewer than 19 views (at 0.95) not even the
 largest is enough: "uncalibrated", widened to the largest of all categories.
 
-Away from viewpoints that are known a mean is less certain. So the threshold is the target and a margin that
-is proportional to `CERTAIN + 1 - support`; it is the margin that is calibrated.
+Away from the photos a mean is less certain, and misses by more. So the threshold is the target and a margin
+that is proportional to `AT_A_PHOTO + away` (`adapt.viewpoint`); it is the margin that is calibrated.
 
 Quality depends on the neighbours' levels too. So compositions are measured: plans made for a range of nominal
 targets by preliminary thresholds. What is calibrated is the nominal target to ask for.
@@ -22,7 +22,7 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
-CERTAIN = 0.25  # of a known viewpoint's margin over that of one far from all
+AT_A_PHOTO = 0.2  # of the margin there, over what it grows by to far from all photos
 
 
 def fewest_views(confidence: float) -> int:

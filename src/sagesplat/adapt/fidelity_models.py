@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from sagesplat.adapt.calibrate import (
-    CERTAIN,
+    AT_A_PHOTO,
     conformal_quantile,
     critical_margins,
     critical_nominals,
@@ -29,9 +29,11 @@ from sagesplat.adapt.calibrate import (
 from sagesplat.adapt.fidelity import SampledFidelity
 from sagesplat.adapt.process import fit_process, inputs_of, matern32
 from sagesplat.adapt.viewpoint import (
+    PHOTO_LENGTHS,
     Calibration,
     Status,
     ViewModel,
+    away_from,
     constant_curve,
     monotone,
     where,
@@ -49,6 +51,7 @@ TARGETS = np.unique(
 NOTHING_HELD = np.zeros(len(TARGETS), bool)
 _ABOVE = 1e-9  # a threshold lies above its critical value
 _MARGINS = (-1.0, 10.0)  # limits of preliminary ones
+MOST_PHOTOS = 256  # by which it is known how far a place is from the photos
 _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more than chance
 
 
@@ -59,6 +62,7 @@ def fit_fidelity(
     confidence: float,
     focal: float,
     screens: tuple[float, float],
+    photos: Sequence[Camera],
 ) -> dict[int, ViewModel]:
     """Fit the expected fidelity of each category over the viewpoint, with preliminary thresholds.
 
@@ -69,11 +73,13 @@ def fit_fidelity(
         confidence: Of the preliminary thresholds.
         focal: Of the photos, pixels.
         screens: Of the viewpoints (`ViewModel`).
+        photos: At least one camera; margins grow away from them.
 
     Returns:
         Models by label id; a category that is shown in no viewpoint has none. They are not calibrated yet.
     """
     position, direction, screen = where(cameras, focal)
+    taken_at = photo_places(photos, extent)
     shown, models = sampled.shown(), {}
     for column, label in enumerate(sampled.labels):
         rows = np.flatnonzero(shown[:, column])
@@ -85,7 +91,7 @@ def fit_fidelity(
         median = float(np.median(known)) if len(known) else 0.0
         inside = np.clip(screen[rows], *screens)
         x = inputs_of(distance, position[rows], direction[rows], extent, median, inside)
-        models[label] = _fit(label, x, values, extent, median, confidence, focal, screens)
+        models[label] = _fit(label, x, values, extent, median, confidence, focal, screens, taken_at)
     return models
 
 
@@ -98,12 +104,13 @@ def _fit(
     confidence: float,
     focal: float,
     screens: tuple[float, float],
+    photos: Float[np.ndarray, "6 P"],
 ) -> ViewModel:
-    photos = np.zeros(len(x), bool)
+    heldout = np.zeros(len(x), bool)
     mean = values.mean(0)
     # the last level is the reference: known, and no part of the process (unless it is the only one)
     learnt = slice(0, max(len(mean) - 1, 1))
-    process = fit_process(x, photos, (values - mean)[:, learnt])
+    process = fit_process(x, heldout, (values - mean)[:, learnt])
     weights = np.zeros(values.shape)
     weights[:, learnt] = process.weights
     left_out = values.copy()
@@ -113,7 +120,7 @@ def _fit(
     near = matern32(x, x, process.lengths)
     np.fill_diagonal(near, 0)
     least = float(near.max(1).min())  # each by the others
-    scale = CERTAIN + 1 - near.max(1)
+    scale = AT_A_PHOTO + away_from(x, photos)
     margins = np.clip(
         [
             np.quantile(critical_margins(left_out, values, target, scale), confidence, method="higher")
@@ -133,13 +140,27 @@ def _fit(
         focal=focal,
         screens=screens,
         inputs=x,
-        heldout_inputs=photos,
+        heldout_inputs=heldout,
         lengths=process.lengths,
         heldout_variance=0.0,
+        photos=photos,
         weights=weights,
         rmse=float(rmse.mean()),
-        calibration=_calibration(TARGETS + CERTAIN * margins, margins, "uncalibrated", confidence, 0, least),
+        calibration=_calibration(
+            TARGETS + AT_A_PHOTO * margins, margins, "uncalibrated", confidence, 0, least
+        ),
     )
+
+
+def photo_places(photos: Sequence[Camera], extent: float) -> Float[np.ndarray, "6 P"]:
+    """`ViewModel.photos` of cameras: at most `MOST_PHOTOS`, each the furthest from those before it."""
+    position, direction, _ = where(photos, 1.0)
+    places = np.column_stack([position / extent, direction])
+    chosen, away = [0], np.full(len(places), np.inf)
+    while len(chosen) < min(MOST_PHOTOS, len(places)):
+        away = np.minimum(away, 1 - matern32(places, places[chosen[-1:]], PHOTO_LENGTHS)[:, 0])
+        chosen.append(int(away.argmax()))
+    return places[np.unique(chosen)].T
 
 
 def _calibration(

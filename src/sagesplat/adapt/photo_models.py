@@ -157,6 +157,7 @@ def _fit(rows: Observations, scene: Scene, curves: tuple[SsimModel, ...]) -> Pho
         heldout_inputs=heldout,
         lengths=process.lengths,
         heldout_variance=process.heldout_variance,
+        photos=np.zeros((6, 0)),
         weights=process.weights,
         rmse=float(np.sqrt(np.mean((left_out - ssim) ** 2))),
     )

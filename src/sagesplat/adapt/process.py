@@ -62,10 +62,10 @@ def inputs_of(
 
 
 def matern32(
-    a: Float[np.ndarray, "A 8"], b: Float[np.ndarray, "B 8"], lengths: Sequence[float]
+    a: Float[np.ndarray, "A D"], b: Float[np.ndarray, "B D"], lengths: Sequence[float]
 ) -> Float[np.ndarray, "A B"]:
-    """c(x, x') of the module's text, for all pairs of inputs."""
-    scale = np.repeat(lengths, [group.stop - group.start for group in GROUPS])
+    """c(x, x') of the module's text, for all pairs of inputs, or of the first groups of them."""
+    scale = np.repeat(lengths, [group.stop - group.start for group in GROUPS[: len(lengths)]])
     scaled_distance = np.sqrt(3) * cdist(a / scale, b / scale)
     return (1 + scaled_distance) * np.exp(-scaled_distance)
 

@@ -9,14 +9,16 @@ evaluates the same formulas (`web/src/core/quality.ts`):
               made monotone over the levels: half of (the largest up to k + the smallest from k on), kept in
               [-1, 1]
     support = max_i c(x, x_i)                       1 at a known viewpoint, 0 far from all
-    bound_k = the largest target whose threshold, at this support, mean_k reaches
-              threshold = threshold_target + slope_target * (1 - support), at least those of lower targets,
-              at most 1
+    away    = 1 - max_p c(x, photo_p)               by position and direction alone, with PHOTO_LENGTHS; of
+                                                    SSIM against photos it is 1 - support
+    bound_k = the largest target whose threshold, this far away, mean_k reaches
+              threshold = threshold_target + slope_target * away, at least those of lower targets, at most 1
 
 `adapt.calibrate` finds, for each target, the threshold: the mean from which on a level keeps the target, at a
-confidence. Between targets it is interpolated. The slopes are for errors that grow away from known
-viewpoints. Where the support is below that of all calibration views there is no bound (NaN): nothing is known
-there. An unknown distance (NaN) counts as `median_log_distance` in x, and m_k is then the median.
+confidence. Between targets it is interpolated. The slopes are for errors that grow away from the photos: what
+no photo showed was trained by none. Where the support is below that of all calibration views there is no
+bound (NaN): nothing is known there. An unknown distance (NaN) counts as `median_log_distance` in x, and m_k
+is then the median.
 
 A viewpoint's screen is its focal length in pixels over that of the photos. Fidelity is known for those in
 `screens`; smaller ones are promised what the smallest has, and on larger ones the picture is meant averaged
@@ -53,6 +55,7 @@ class Prediction(NamedTuple):
     mean: Float[np.ndarray, "V K"]
     bound: Float[np.ndarray, "V K"]  # lower confidence bound; like the mean, it never falls along the levels
     support: Float[np.ndarray, " V"]  # 1 at a known viewpoint, 0 far from all
+    away: Float[np.ndarray, " V"]  # 0 at a photo, 1 far from all
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,20 +66,24 @@ class Calibration:
     confidence: Annotated[float, Meta(gt=0, lt=1)]  # share of decisions that hold
     num_views: Count  # calibration views that show the category
     targets: Float[np.ndarray, " G"]  # ascending
-    thresholds: Float[np.ndarray, " G"]  # the mean from which on a level keeps the target, at support 1
-    slopes: Float[np.ndarray, " G"]  # by which that rises to where the support is 0
+    thresholds: Float[np.ndarray, " G"]  # the mean from which on a level keeps the target, at a photo
+    slopes: Float[np.ndarray, " G"]  # by which that rises to far from all photos
     least_support: Share  # below it there is no bound
 
     def bound(
-        self, mean: Float[np.ndarray, "V K"], support: Float[np.ndarray, " V"]
+        self,
+        mean: Float[np.ndarray, "V K"],
+        support: Float[np.ndarray, " V"],
+        away: Float[np.ndarray, " V"] | None = None,
     ) -> Float[np.ndarray, "V K"]:
         """The largest target that each mean keeps; below the first target the same distance from the mean.
 
-        NaN without any target, and where the support is too small.
+        NaN without any target, and where the support is too small. `away`: None: 1 - support.
         """
+        away = 1 - support if away is None else away
         if not len(self.targets):
             return np.full(mean.shape, np.nan)
-        needed = np.minimum(np.maximum.accumulate(self.thresholds + np.outer(1 - support, self.slopes), 1), 1)
+        needed = np.minimum(np.maximum.accumulate(self.thresholds + np.outer(away, self.slopes), 1), 1)
         found = np.array(
             [np.interp(m, n, self.targets) for m, n in zip(mean, needed, strict=True)], np.float64
         ).reshape(mean.shape)
@@ -88,6 +95,7 @@ class Calibration:
 
 NO_CALIBRATION = Calibration("uncalibrated", 0.95, 0, np.zeros(0), np.zeros(0), np.zeros(0), 0.0)
 PHOTOS_ONLY = (1.0, 1.0)  # screens of a model that knows the photos' pixels alone
+PHOTO_LENGTHS = (0.3, 0.5)  # of position / extent and direction, for how far a place is from the photos
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +113,7 @@ class ViewModel:
     heldout_inputs: Bool[np.ndarray, " n"]  # photos that training never saw; of fidelity none
     lengths: tuple[Positive, Positive, Positive, Positive]  # of the groups of inputs
     heldout_variance: NotNegative  # over the variance of the process
+    photos: Float[np.ndarray, "6 P"]  # position / extent and direction of photos; none: the views are photos
     weights: Float[np.ndarray, "n K"]
     rmse: Number  # of its views, each predicted without itself; over all levels
     calibration: Calibration = field(default=NO_CALIBRATION)
@@ -145,8 +154,8 @@ class ViewModel:
             screen: [V], focal length in pixels over `focal`; None: 1.
 
         Returns:
-            mean and bound [V, K], each column a level; support [V]: 1 at a known viewpoint, 0 far from all.
-            The bound is NaN where the support is too small.
+            mean and bound [V, K], each column a level; support [V]: 1 at a known viewpoint, 0 far from all;
+            away [V]: 0 at a photo, 1 far from all. The bound is NaN where the support is too small.
 
         Example:
             >>> import numpy as np
@@ -161,7 +170,8 @@ class ViewModel:
         k = near + self.heldout_variance * self.heldout_inputs
         mean = monotone(means_at(self.curves, distance) + k @ self.weights)
         support = near.max(1)
-        return Prediction(mean, self.calibration.bound(mean, support), support)
+        away = away_from(x, self.photos) if self.photos.size else 1 - support
+        return Prediction(mean, self.calibration.bound(mean, support, away), support, away)
 
     def inputs_at(
         self,
@@ -188,6 +198,11 @@ def where(cameras: Sequence[Camera], focal: float) -> Where:
     position = np.array([camera.position for camera in cameras], np.float64).reshape(-1, 3)
     direction = np.array([camera.direction for camera in cameras], np.float64).reshape(-1, 3)
     return Where(position, direction, np.array([camera.focal for camera in cameras], np.float64) / focal)
+
+
+def away_from(x: Float[np.ndarray, "V 8"], photos: Float[np.ndarray, "6 P"]) -> Float[np.ndarray, " V"]:
+    """How far viewpoints, given by their inputs, are from the photos: 0 at one of them, 1 far from all."""
+    return 1 - matern32(x[:, :6], photos.T, PHOTO_LENGTHS).max(1)
 
 
 def monotone(mean: Float[np.ndarray, "V K"]) -> Float[np.ndarray, "V K"]:
@@ -242,6 +257,7 @@ def _check(model: ViewModel) -> None:
     if not model.screens[0] <= model.screens[1]:
         raise ValueError("screens out of order")
     if not all(
-        (np.abs(array) < LARGEST).all() for array in (model.inputs, model.weights, thresholds, slopes)
+        (np.abs(array) < LARGEST).all()
+        for array in (model.inputs, model.photos, model.weights, thresholds, slopes)
     ):
         raise ValueError("numbers out of range")

@@ -15,6 +15,7 @@ from sagesplat.adapt.fidelity_models import (
     remove_composition_bias,
 )
 from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.adapt.viewpoints import capture_cameras
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
 from sagesplat.run.executor import split
@@ -35,7 +36,9 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
         Compositions(job, [drawn.cameras[row] for row in drawn.rows(name)])
         for name in ("bias", "calibration")
     )
-    models = fit_fidelity(sampled, fit, job.scene.scale, confidence, drawn.focal, drawn.rule.screens)
+    models = fit_fidelity(
+        sampled, fit, job.scene.scale, confidence, drawn.focal, drawn.rule.screens, capture_cameras(job.scene)
+    )
     models.pop(UNLABELLED, None)  # has no target and stays in full
     for _ in range(_ROUNDS):
         models = remove_composition_bias(models, trial(job, config, models, sampled.labels, bias), confidence)

@@ -65,7 +65,9 @@ def _fit_drawn(
     drawn, sampled, confidence = viewpoints_of(job), sampled_of(job), config.confidence
     fit = [drawn.cameras[row] for row in drawn.rows("fit")]
     mine = _columns(sampled, [label for label in sampled.labels if label in changed and label != UNLABELLED])
-    models = fit_fidelity(mine, fit, job.scene.scale, confidence, drawn.focal, drawn.rule.screens)
+    models = fit_fidelity(
+        mine, fit, job.scene.scale, confidence, drawn.focal, drawn.rule.screens, capture_cameras(job.scene)
+    )
     for name, step in (("bias", remove_composition_bias), ("calibration", calibrated)):
         cameras = _some([drawn.cameras[row] for row in drawn.rows(name)], _MOST[name])
         measured = trial(

@@ -118,8 +118,9 @@ def _until_it_stops_shrinking(
         if stop == stops[-1]:
             break
         models = fit_fidelity(
-            table, cameras[:stop], job.scene.scale, fit.confidence, drawn.focal, drawn.rule.screens
-        )
+            table, cameras[:stop], job.scene.scale, fit.confidence, drawn.focal, drawn.rule.screens,
+            capture_cameras(job.scene),
+        )  # fmt: skip
         errors.append(float(np.mean([model.rmse for model in models.values()])))
         if len(errors) > 1 and errors[-1] > (1 - _SHRINKS) * errors[-2]:
             break

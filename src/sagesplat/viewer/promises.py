@@ -3,9 +3,9 @@
 A mean over the viewpoint is written as its values at the model's views, not as weights. Weights cancel each
 other and need many digits; a value that is rounded moves the mean by about as much. A reader solves for them
 (`viewer.sent_model`). An offset holds what does not depend on the viewpoint: the mean of fidelity, and what
-views differ by that training never saw. Numbers are whole steps of a unit. The shared
-views are in the order of a path from each to the nearest one left, and lists over views hold differences to
-the view before: most are small. Values hold differences to the level below as well.
+views differ by that training never saw. Numbers are whole steps of a unit. The shared views, and the photos,
+are in the order of a path from each to the nearest one left, and lists over them hold differences to the one
+before: most are small. Values hold differences to the level below as well.
 """
 
 import math
@@ -61,14 +61,17 @@ def promises_document(
     place = np.zeros(len(views), int)
     place[used] = np.arange(len(used))
     shared = np.round(views[used] * AXES / STEP).astype(int)
+    photos = some.photos.T[_path(some.photos.T)]
+    photos = np.round(photos * AXES[:6] / STEP).astype(int).T
     return {
         "quality": quality,
         "extent": some.extent,
         "focal": significant(some.focal),
         "screens": significant(some.screens),
         "views": [_differences(column) for column in shared.T],
+        "photos": [_differences(column) for column in photos],
         "labels": [
-            _entry(model, place[rows[label]], rows[label], used, shared, seen.get(label))
+            _entry(model, place[rows[label]], rows[label], used, shared, photos, seen.get(label))
             for label, model in models.items()
         ],
     }
@@ -80,6 +83,7 @@ def _entry(
     rows: Int[np.ndarray, " n"],
     used: Int[np.ndarray, " U"],
     shared: Int[np.ndarray, "U 7"],
+    photos: Int[np.ndarray, "6 P"],
     seen: Seen | None,
 ) -> dict[str, Any]:
     """The entry of a model; `places`: its views among the shared ones, `rows`: among the cameras."""
@@ -107,10 +111,15 @@ def _entry(
         "shares": _differences(np.round(shares / STEP)),
         "corrections": _differences(np.round(np.nan_to_num(corrections) / CORRECTION_STEP)),
     }
-    return _rounded(entry, replace(model, **ordered), shared)
+    return _rounded(entry, replace(model, **ordered), shared, photos)
 
 
-def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U 7"]) -> dict[str, Any]:
+def _rounded(
+    entry: dict[str, Any],
+    model: ViewModel,
+    shared: Int[np.ndarray, "U 7"],
+    photos: Int[np.ndarray, "6 P"],
+) -> dict[str, Any]:
     """The entry with log distances, values and thresholds, in the coarsest units that are allowed."""
     own = model.inputs
     at = np.concatenate([own, (own + own[_neighbours(own)]) / 2])
@@ -122,7 +131,7 @@ def _rounded(entry: dict[str, Any], model: ViewModel, shared: Int[np.ndarray, "U
     sent, change = entry, math.inf
     for log_unit, unit in _UNITS if len(own) <= MOST_VIEWS else _UNITS[:1]:
         sent = _with_values(entry, model, shared, log_unit, significant(unit * coarser, 4))
-        after = model_of_entry(sent, shared, model.extent, model.screens).predict(*viewpoints)
+        after = model_of_entry(sent, shared, photos, model.extent, model.screens).predict(*viewpoints)
         change = _relative_change(before, after, model.calibration.slopes)
         if change <= 1:
             break
@@ -158,7 +167,7 @@ def _with_values(
 def _relative_change(before: Prediction, after: Prediction, slopes: Float[np.ndarray, " G"]) -> float:
     """The largest change of what bounds come from, over what is allowed."""
     steepest = np.abs(slopes).max(initial=0.0)
-    change = np.abs(after.mean - before.mean) + steepest * np.abs(after.support - before.support)[:, None]
+    change = np.abs(after.mean - before.mean) + steepest * np.abs(after.away - before.away)[:, None]
     return float((change / allowed_change(before.mean)).max())
 
 
@@ -206,9 +215,9 @@ def _neighbours(points: Float[np.ndarray, "n D"]) -> Int[np.ndarray, " n"]:
 
 def _path(points: Float[np.ndarray, "n D"]) -> Int[np.ndarray, " n"]:
     """An order of points, each followed by the nearest one left."""
-    path, left = [0], np.arange(1, len(points))
+    path, left = [*range(min(len(points), 1))], np.arange(1, len(points))
     while len(left):
         apart = ((points[left] - points[path[-1]]) ** 2).sum(1)
         path.append(int(left[apart.argmin()]))
         left = np.delete(left, apart.argmin())
-    return np.array(path)
+    return np.array(path, int)

@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.process import inputs_of, matern32
-from sagesplat.adapt.viewpoint import Calibration, Prediction, means_at, monotone
+from sagesplat.adapt.viewpoint import Calibration, Prediction, away_from, means_at, monotone
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.quality import curve_of
 
@@ -43,6 +43,7 @@ class SentModel:
     screens: tuple[float, float]
     inputs: Float[np.ndarray, "n 8"]
     lengths: tuple[float, float, float, float]
+    photos: Float[np.ndarray, "6 P"]
     weights: Float[np.ndarray, "n K"]
     corrections: Float[np.ndarray, " n"]
     calibration: Calibration
@@ -61,7 +62,8 @@ class SentModel:
         curves = means_at(self.curves, distance) if self.curves else 0.0
         mean = monotone(curves + self.offsets + near @ self.weights)
         support = near.max(1)
-        return Prediction(mean, self.calibration.bound(mean, support), support)
+        away = away_from(x, self.photos) if self.photos.size else 1 - support
+        return Prediction(mean, self.calibration.bound(mean, support, away), support, away)
 
     def corrected(
         self,
@@ -83,14 +85,18 @@ class SentModel:
 def read_model(document: dict[str, Any], label_id: int) -> SentModel:
     """The model of a label in a document."""
     (entry,) = (entry for entry in document["labels"] if entry["id"] == label_id)
-    shared = np.cumsum(document["views"], 1).T
-    return model_of_entry(entry, shared, document["extent"], document["screens"])
+    shared, photos = np.cumsum(document["views"], 1).T, np.cumsum(document["photos"], 1, dtype=int)
+    return model_of_entry(entry, shared, photos, document["extent"], document["screens"])
 
 
 def model_of_entry(
-    entry: dict[str, Any], shared: Int[np.ndarray, "U 7"], extent: float, screens: Sequence[float]
+    entry: dict[str, Any],
+    shared: Int[np.ndarray, "U 7"],
+    photos: Int[np.ndarray, "6 P"],
+    extent: float,
+    screens: Sequence[float],
 ) -> SentModel:
-    """The model of an entry; `shared`: the views that the labels share, in steps."""
+    """The model of an entry; `shared`, `photos`: the views and photos that the labels share, in steps."""
     inputs = inputs_of_entry(entry, shared)
     lengths = position, direction, screen, distance = entry["lengths"]
     values = np.cumsum(np.cumsum(entry["values"]["steps"], 0), 1).T * entry["values"]["units"]
@@ -110,6 +116,7 @@ def model_of_entry(
         screens=(screens[0], screens[1]),
         inputs=inputs,
         lengths=(position, direction, screen, distance),
+        photos=(photos.T / STEPS_PER_UNIT * AXES[:6]).T,
         weights=weights,
         corrections=np.cumsum(entry["corrections"]) * CORRECTION_STEP,
         calibration=calibration,

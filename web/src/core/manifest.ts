@@ -106,8 +106,8 @@ function packDefects({ pack, labels }: Manifest): string[] {
 export function parsePromises(json: string, file: string, quality: Quality): Promises {
   const found = checked<Promises>(parse(json, file), root, file, PROMISES);
   const shared = found.views[0]?.length ?? 0;
-  const even = found.views.every((column) => column.length === shared);
-  refuse(even ? [] : ["views must have columns of equal length"], file);
+  const even = [found.views, found.photos].every((all) => all.every((one) => one.length === all[0]?.length));
+  refuse(even ? [] : ["views and photos must have columns of equal length"], file);
   refuse(found.quality === quality ? [] : [`quality must be ${JSON.stringify(quality)}`], file);
   refuse(
     found.screens[0] <= found.screens[1] ? [] : ["screens must be from the smaller to the larger"],

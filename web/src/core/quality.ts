@@ -49,6 +49,8 @@ const NEIGHBOUR_EXPONENT = 16;
 const HALF_WEIGHT = 1e-3;
 
 const COLUMNS = 7; // of the shared views: position over the extent, direction, log screen
+const PHOTO_COLUMNS = 6; // of the photos: without the screen
+const PHOTO_LENGTHS = [0.3, 0.5] as const; // of position and direction, for how far one is from the photos
 
 /** The views that the models of all labels share, and how far they are from the current viewpoint. */
 export class Views {
@@ -56,13 +58,14 @@ export class Views {
   readonly turned: Float64Array; // [V] square of the difference of the directions
   readonly rescaled: Float64Array; // [V] square of the difference of the log screens
   readonly rows: Float64Array; // [V, COLUMNS]
+  private readonly photos: Float64Array; // [P, PHOTO_COLUMNS]
+  fromPhotos = Number.NaN; // of the current viewpoint: 0 at a photo, 1 far from all; NaN: none are known
   private last: From | null = null;
 
-  constructor(private readonly sent: Pick<Promises, "views" | "extent" | "focal" | "screens">) {
-    const columns = sent.views.map((column) => sums(column, STEP));
-    const count = columns[0]?.length ?? 0;
-    const at = (i: number) => columns[i % COLUMNS]?.[Math.floor(i / COLUMNS)] ?? 0;
-    this.rows = Float64Array.from({ length: COLUMNS * count }, (_, i) => at(i));
+  constructor(private readonly sent: Pick<Promises, "views" | "photos" | "extent" | "focal" | "screens">) {
+    this.rows = byRow(sent.views);
+    this.photos = byRow(sent.photos);
+    const count = this.rows.length / COLUMNS;
     this.away = new Float64Array(count);
     this.turned = new Float64Array(count);
     this.rescaled = new Float64Array(count);
@@ -75,14 +78,32 @@ export class Views {
     const { rows, sent } = this;
     const [x, y, z] = viewpoint.position.map((p) => p / sent.extent) as [number, number, number];
     const [a, b, c] = viewpoint.direction;
-    const [least, most] = sent.screens;
-    const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), least), most));
+    const [smallest, largest] = sent.screens;
+    const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), smallest), largest));
     for (let i = 0, at = 0; i < this.away.length; i++, at += COLUMNS) {
       this.away[i] = square(x, y, z, rows, at);
       this.turned[i] = square(a, b, c, rows, at + 3);
       this.rescaled[i] = (screen - (rows[at + 6] as number)) ** 2;
     }
+    const [position, direction] = PHOTO_LENGTHS;
+    let least = Infinity;
+    for (let at = 0; at < this.photos.length; at += PHOTO_COLUMNS) {
+      const away = square(x, y, z, this.photos, at) / position ** 2;
+      least = Math.min(least, away + square(a, b, c, this.photos, at + 3) / direction ** 2);
+    }
+    this.fromPhotos = least < Infinity ? 1 - matern(least) : Number.NaN;
   }
+}
+
+/** Rows from the columns of a document, which hold differences. */
+function byRow(columns: readonly (readonly number[])[]): Float64Array {
+  const rows = new Float64Array(columns.length * (columns[0]?.length ?? 0));
+  columns.forEach((column, c) => {
+    sums(column, STEP).forEach((value, row) => {
+      rows[row * columns.length + c] = value;
+    });
+  });
+  return rows;
 }
 
 /** A viewpoint's screen: the focal length of what is drawn over the photos'. */
@@ -197,7 +218,8 @@ export class ViewModel {
     const unknown = label.levels.map(() => Number.NaN);
     const known = this.targets.length > 0;
     const outside = support < sent.leastSupport;
-    const needed = this.needed(support);
+    const far = this.views.fromPhotos;
+    const needed = this.needed(Number.isNaN(far) ? 1 - support : far);
     const bound = mean.map((m) => (outside || !known ? Number.NaN : this.bound(m, needed)));
     return {
       mean: spread(mean, sent.levels, unknown),
@@ -207,11 +229,11 @@ export class ViewModel {
     };
   }
 
-  /** The mean from which on a level keeps each target at a support: never less than for a lower target, at most 1. */
-  private needed(support: number): Float64Array {
+  /** The mean from which on a level keeps each target that far away: never less than for a lower one, at most 1. */
+  private needed(away: number): Float64Array {
     let least = -Infinity;
     return this.thresholds.map((threshold, g) => {
-      least = Math.max(least, threshold + (this.slopes[g] as number) * (1 - support));
+      least = Math.max(least, threshold + (this.slopes[g] as number) * away);
       return Math.min(least, 1);
     });
   }

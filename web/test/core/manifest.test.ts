@@ -188,7 +188,7 @@ test.each([
   ["focal", 0, "focal must be a number above 0"],
   ["screens", [1], "screens must be a list of 2"],
   ["screens", [2, 0.5], "screens must be from the smaller to the larger"],
-  ["views.0", [1], "views must have columns of equal length"],
+  ["views.0", [1], "views and photos must have columns of equal length"],
   ["views.0.1", 0.5, "views[0][1] must be a whole number"],
   ["labels.0.shares", [5000], "labels[0] has lists"],
   ["labels.0.shares.0", 20_000, "labels[0] has shares or corrections out of range"],
