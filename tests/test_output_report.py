@@ -353,6 +353,18 @@ def test_plans_for_fidelity_are_compared_with_equal_levels_at_the_same_views():
     assert composed[:, 1] == pytest.approx([0.955, 0.955])  # the plan for SSIM is not in it
 
 
+def test_the_lowest_category_is_drawn_beside_the_whole_image():
+    data = led_by_fidelity()
+    drawn = {3: np.array([[0.5, 0.9, 1], [0.7, np.nan, np.nan]]), 7: np.array([[0.8, 0.85, 1]] * 2)}
+    uniform, sizes = data.evaluation.uniform("fidelity"), data.sizes or {}
+    figure = figures.quality_over_size(
+        uniform, sizes, data.plans, data.evaluation, "fidelity", drawn=drawn
+    )  # fmt: skip
+    equal, planned = (np.asarray(line.get_ydata()) for line in figure.axes[0].lines[2:4])
+    assert equal == pytest.approx([0.6, 0.85])
+    assert planned == pytest.approx([0.6, 0.6])  # both at their first level
+
+
 def test_same_data_same_figure(tmp_path):
     data = make(panels=0)
     sizes = {key: 248 * count for key, count in data.counts.items()}

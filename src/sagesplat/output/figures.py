@@ -309,10 +309,12 @@ def quality_over_size(
     evaluation: Evaluation,
     quality: QualityKind,
     unit: str = RAW,
+    drawn: Mapping[int, np.ndarray] | None = None,
 ) -> Figure:
-    """Quality of the whole image on unseen views over model size: one level for all, and each target's plan.
+    """Quality on unseen views over model size: all categories at one level, and each target's plan.
 
-    `uniform`: mean quality of the whole image by level; `sizes`: bytes of each (label id, level).
+    `uniform`: mean quality of the whole image by level; `sizes`: bytes of each (label id, level); `drawn`:
+    fidelity [V, K] of each label's levels at drawn viewpoints, which adds the lowest category's.
     """
     figure = Figure(figsize=PAIR, layout="constrained")
     axes = figure.subplots()
@@ -325,6 +327,23 @@ def quality_over_size(
         if len(whole) and plan.quality == quality:
             composed.append((sum(map(bytes_of, plan.choices)) / MB, float(np.nanmean(whole)), plan.target))
     axes.plot(*np.array(composed).reshape(-1, 3).T[:2], "o-", color=ACCENT, ms=6, label="composed by plan")
+    if drawn and composed:
+        means = {label: np.nanmean(values, 0) for label, values in drawn.items() if np.isfinite(values).any()}
+        levels = sorted({level for _, level in sizes})
+        lowest = np.min([*means.values()], axis=0)
+        axes.plot(size, lowest[[levels.index(level) for level in uniform]], "--", color=FAINT)
+        planned = [
+            min(
+                mean[levels.index(plan.levels[label])]
+                for label, mean in means.items()
+                if label in plan.levels
+            )
+            for target in composed
+            for plan in plans
+            if (plan.quality, plan.target) == (quality, target[2])
+        ]
+        axes.plot([x for x, _, _ in composed], planned, "--", color=ACCENT)
+        axes.plot([], [], "--", color=INK, label="the same, lowest category")
     for x, y, target in composed:
         axes.annotate(f"t = {target:g}", (x, y), (7, -11), textcoords="offset points", color=ACCENT)
     of = "against the full model" if quality == "fidelity" else "against photos"

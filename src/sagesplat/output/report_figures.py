@@ -47,7 +47,13 @@ def report_figures(
             "quality_over_size",
             "Quality over size on unseen views",
             figures.quality_over_size(
-                _uniform(data), sizes_of(data), data.plans, data.evaluation, quality, unit
+                _uniform(data),
+                sizes_of(data),
+                data.plans,
+                data.evaluation,
+                quality,
+                unit,
+                data.drawn if quality == "fidelity" else None,
             ),
         )
         yield (

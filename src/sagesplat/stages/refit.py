@@ -9,6 +9,7 @@ from sagesplat.adapt.eq3 import write_models
 from sagesplat.adapt.fidelity import SampledFidelity
 from sagesplat.adapt.fidelity_models import calibrated, fit_fidelity, remove_composition_bias
 from sagesplat.adapt.viewpoint import ViewModel, write_promises
+from sagesplat.adapt.viewpoints import capture_cameras
 from sagesplat.core.config import FitConfig
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
