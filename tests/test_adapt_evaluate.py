@@ -78,6 +78,7 @@ def test_both_qualities_are_measured(capture, tmp_path: Path):
     whole = full.label_id == TOTAL
     assert full.ms_ssim[whole] == pytest.approx(full.full_ms_ssim[whole])
     assert np.isnan(full.ms_ssim[~whole]).all()
+    assert np.isnan(full.flip).all()  # nobody asked
     assert set(low.predicted[low.label_id != TOTAL]) == {0}
     assert set(photo.predicted[photo.label_id != TOTAL]) == {1}  # the same target, of the other quality
     np.testing.assert_array_equal(low.of_own_quality().ssim, low.fidelity)
@@ -88,6 +89,16 @@ def test_both_qualities_are_measured(capture, tmp_path: Path):
     assert UNIFORM not in np.concatenate([one.label_id for one in (full, low, photo)])
     table.write_csv(tmp_path / "e.csv")
     np.testing.assert_array_equal(read_evaluation(tmp_path / "e.csv").fidelity, table.fidelity)
+
+
+def test_further_similarities_are_of_whole_images_of_plans(capture):
+    table = measured(capture, others={"flip": lambda image, photo: float(np.abs(image - photo).mean())})
+    low = table.of(PLANS[1])
+    whole = low.label_id == TOTAL
+    assert (low.flip[whole] > 0).all()
+    assert np.isfinite(low.full_flip[whole]).all()
+    assert np.isnan(low.flip[~whole]).all()
+    assert np.isnan(low.ms_ssim).all()
 
 
 def test_images_of_the_full_model_take_bounded_memory(capture, monkeypatch):

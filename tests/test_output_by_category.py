@@ -17,7 +17,7 @@ def evaluation(rows: list[tuple[float, int, float, int]]) -> Evaluation:
     zero, measured = np.zeros(len(rows), i), ssim.astype(f)
     return Evaluation(
         zero + 1, target.astype(f), zero, label.astype(i), zero, measured, measured, measured, 30 * measured,
-        measured, 30 * measured, pixels.astype(i), *[measured] * 8,
+        measured, 30 * measured, pixels.astype(i), *[measured] * 12,
     )  # fmt: skip
 
 

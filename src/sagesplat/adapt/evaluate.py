@@ -38,7 +38,9 @@ from sagesplat.segment.valid import ALL_VALID, ValidPixels
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)  # by the number in the table
 UNIFORM = -3  # label id of the whole image with all categories at one level
 COLOURS = ("plain_psnr", "cc_psnr", "cc_ssim")  # of `measure_colours`
-OF_WHOLE = (*COLOURS, "ms_ssim")  # columns that only whole images of plans have
+OTHERS = ("ms_ssim", "flip", "lpips")  # further similarities to the photo, with its exposure
+OF_WHOLE = (*COLOURS, *OTHERS)  # columns that only whole images of plans have
+Similarity = Callable[[np.ndarray, np.ndarray], float]
 KEPT = 512 * 2**20  # bytes of the full model's images to keep; of further views they are rendered again
 
 
@@ -70,8 +72,13 @@ class Evaluation(ColumnTable):
     full_plain_psnr: Float32[np.ndarray, " R"]
     full_cc_psnr: Float32[np.ndarray, " R"]
     full_cc_ssim: Float32[np.ndarray, " R"]
-    ms_ssim: Float32[np.ndarray, " R"]  # of the same rows, against the photo, with its exposure
+    # of the same rows, against the photo, with its exposure; NaN where it was not measured
+    ms_ssim: Float32[np.ndarray, " R"]
+    flip: Float32[np.ndarray, " R"]
+    lpips: Float32[np.ndarray, " R"]
     full_ms_ssim: Float32[np.ndarray, " R"]
+    full_flip: Float32[np.ndarray, " R"]
+    full_lpips: Float32[np.ndarray, " R"]
 
     def of(self, plan: Plan) -> "Evaluation":
         """The rows of a plan: for its target, or within the budget."""
@@ -106,6 +113,7 @@ def evaluate(
     plans: Sequence[Plan],
     predicted: Callable[[QualityKind, int, int, int], float],
     *,
+    others: Mapping[str, Similarity] | None = None,
     uniform: Sequence[int] = (),
     compose: Callable[[Plan], Gaussians] | None = None,
     valid: ValidPixels = ALL_VALID,
@@ -122,6 +130,7 @@ def evaluate(
         ladder: The levels.
         plans: What to compose.
         predicted: What is expected of (quality, label id, level, row of `Scene.views`); NaN: none.
+        others: Of OTHERS, what to measure of whole images (image, photo); None: MS-SSIM.
         uniform: Levels to measure with all categories at that level, to compare the plans with.
         compose: The Gaussians of a plan; None: its levels as they are.
         valid: The pixels of photos that count; views without any are left out.
@@ -143,7 +152,9 @@ def evaluate(
     def render(g: Gaussians, camera: Camera) -> np.ndarray:
         return render_rgb(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
 
-    def measure_all(g: Gaussians):
+    others = {"ms_ssim": ms_ssim} if others is None else others
+
+    def measure_all(g: Gaussians, further: Mapping[str, Similarity]):
         nonlocal done
         g = g.to(device_of(backend))
 
@@ -165,8 +176,8 @@ def evaluate(
             if view.camera.exposure is not None:
                 image = render(g, view.camera)
             measured = measure(image, photo, masks[view], inner[row], valid[view])
-            multi_scale = ms_ssim(image, pasted(photo, image, valid[view]), valid[view])
-            measured[TOTAL] |= {**colours, "ms_ssim": multi_scale}
+            against = pasted(photo, image, valid[view])
+            measured[TOTAL] |= {**colours, **{name: of(image, against) for name, of in further.items()}}
             return row, measured, fidelity
 
         for found in each_view(in_view, views, device_of(backend)):
@@ -175,9 +186,9 @@ def evaluate(
             if progress:
                 progress(done, total)
 
-    full = {row: measured for row, measured, _ in measure_all(last)}
+    full = {row: measured for row, measured, _ in measure_all(last, others)}
     for level in uniform:
-        for row, measured, fidelity in measure_all(ladder.load(level)):
+        for row, measured, fidelity in measure_all(ladder.load(level), {}):
             rows.append({
                 "quality": QUALITIES.index("fidelity"), "target": np.nan,
                 "view": row, "label_id": UNIFORM, "level": level,
@@ -188,7 +199,8 @@ def evaluate(
                 **_of_whole({}, {}),
             })  # fmt: skip
     for plan in plans:
-        for row, measured, fidelity in measure_all(compose(plan) if compose else ladder.compose(plan.levels)):
+        composed = compose(plan) if compose else ladder.compose(plan.levels)
+        for row, measured, fidelity in measure_all(composed, others):
             for label, values in measured.items():
                 level, known = plan.levels.get(label, -1), label in plan.levels
                 rows.append({

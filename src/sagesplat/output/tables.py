@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.evaluate import QUALITIES, Evaluation
+from sagesplat.adapt.evaluate import OTHERS, QUALITIES, Evaluation
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.adapt.plan import Choice, Counts, Plan, quality_title
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
@@ -252,7 +252,7 @@ def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mappi
             others = (mean(rows.full_ssim), mean(rows.psnr), mean(rows.full_psnr))
             others += (mean(rows.plain_psnr), mean(rows.cc_ssim), mean(rows.cc_psnr))
             others += (mean(rows.full_plain_psnr), mean(rows.full_cc_ssim), mean(rows.full_cc_psnr))
-            others += (mean(rows.ms_ssim), mean(rows.full_ms_ssim))
+            others += tuple(mean(getattr(rows, f"{of}{name}")) for of in ("", "full_") for name in OTHERS)
             named = (quality_title(QUALITIES[i]), float(f"{target:g}"), name_of(label_id, names), len(rows))
             body.append((*named, *share, *found, *others))
     header = ("quality", "target", "category", "views", "promised", "kept", "share kept", "fidelity")
@@ -261,7 +261,9 @@ def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mappi
     for model in ("", "full model "):
         header += (f"{model}plain PSNR", f"{model}cc_ssim", f"{model}cc_psnr")
         formats += (".2f", ".3f", ".2f")
-    header, formats = (*header, "MS-SSIM", "full model MS-SSIM"), (*formats, ".3f", ".3f")
+    for model in ("", "full model "):
+        header += tuple(f"{model}{title}" for title in ("MS-SSIM", "FLIP", "LPIPS"))
+        formats += (".3f",) * 3
     return Table("Promised and measured, unseen views", header, formats, body)
 
 

@@ -1,15 +1,20 @@
 """Makes the evaluation: the plans measured on the test views."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-from sagesplat.adapt.evaluate import Evaluation, evaluate
+from sagesplat.adapt.evaluate import OTHERS, Evaluation, Similarity, evaluate
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.events import Progress
+from sagesplat.metrics.flip import flip_map, missing
+from sagesplat.metrics.lpips import load_lpips, weights_path
+from sagesplat.metrics.ms_ssim import ms_ssim
 from sagesplat.output import tables
 from sagesplat.run.job import Job
+from sagesplat.run.records import file_hash
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.compose import compose_inputs
@@ -22,12 +27,14 @@ def evaluate_plans(job: Job) -> None:
     """Measure the compositions on the test views, beside what was promised and the full model."""
     run, method = job.run, method_of(job)
 
+    flip, lpips = missing() is None, weights_path("alex")
+
     def make() -> list[str]:
         within = budget_plan_of(job)
         plans = [*plans_of(job), *([within] if within else [])]
         table = evaluate(
             job.scene, job.photos, job.level_masks, job.ladder, plans, method.predicted,
-            uniform=_levels_beside(job, plans),
+            others=_others(flip, lpips), uniform=_levels_beside(job, plans),
             compose=lambda plan: job.ladder.compose(plan.levels), valid=job.valid,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
@@ -41,7 +48,18 @@ def evaluate_plans(job: Job) -> None:
 
     fitted = [run.provenance("observe"), run.provenance("fit")]
     inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
-    run_stage(job, "evaluate", {"colours": True, "ms_ssim": True}, inputs, [run.evaluation], make)
+    settings = {"flip": flip, "lpips": file_hash(lpips) if lpips.is_file() else None}
+    run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
+
+
+def _others(flip: bool, lpips: Path) -> dict[str, Similarity]:
+    """MS-SSIM; FLIP where its extra is installed, LPIPS where its weights were downloaded."""
+    found: dict[str, Similarity] = {"ms_ssim": ms_ssim}
+    if flip:
+        found["flip"] = lambda image, photo: float(flip_map(image, photo).mean())
+    if lpips.is_file():
+        found["lpips"] = load_lpips("alex", lpips)
+    return found
 
 
 def _levels_beside(job: Job, plans: Sequence[Plan]) -> list[int]:
@@ -64,8 +82,19 @@ def _lines(plan: Plan, rows: Evaluation, exposed: bool) -> list[str]:
         f"{asked}: test views {fidelity}{at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
         f"(full model {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
         f"{', with colours fitted to their photos' if exposed else ''}",
+        _further(at),
         *([_colours(at)] if exposed else []),
     ]
+
+
+def _further(at: Evaluation) -> str:
+    """What else was measured of the same images, of the plan and of the full model."""
+    told = [
+        f"{title} {getattr(at, name).mean():.3f} ({getattr(at, 'full_' + name).mean():.3f})"
+        for name, title in zip(OTHERS, ("MS-SSIM", "FLIP", "LPIPS"), strict=True)
+        if not np.isnan(getattr(at, name)).all()
+    ]
+    return f"  {', '.join(told)}"
 
 
 def _colours(at: Evaluation) -> str:
