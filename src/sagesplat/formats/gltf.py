@@ -30,26 +30,27 @@ from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.formats.spz import decode_spz
 from sagesplat.io.files import loads_json, regular
 
-_NAME = "KHR_gaussian_splatting"
+NAME = "KHR_gaussian_splatting"
 _SPZ = (
-    f"{_NAME}_compression_spz_2",
-    f"{_NAME}_compression_spz",
-    "KHR_spz_gaussian_splats_compression",  # drafts, in place of _NAME
+    f"{NAME}_compression_spz_2",
+    f"{NAME}_compression_spz",
+    "KHR_spz_gaussian_splats_compression",  # drafts, in place of NAME
     "KHR_spz_compression",
 )
-_SUPPORTED = {_NAME, *_SPZ, "KHR_mesh_quantization", "EXT_mesh_features", "EXT_structural_metadata"}
+_SUPPORTED = {NAME, *_SPZ, "KHR_mesh_quantization", "EXT_mesh_features", "EXT_structural_metadata"}
 _NO_MATTER = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")  # for splats
-_COLOURS = ("srgb_rec709_display", "BT.709", "BT.709-sRGB")  # the latter are of drafts
+COLOURS = "srgb_rec709_display"
+_COLOURS = (COLOURS, "BT.709", "BT.709-sRGB")  # the latter are of drafts
 _DRAFTS = {"ROTATION": "_ROTATION", "SCALE": "_SCALE"}
 _CURE = "export it again"
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _NODES = 10_000
 _MOST_LOG = 50.0  # of a scale: e^50 is none
-_EXTRAS = "sagesplat-labels"
-_FEATURES = "_FEATURE_ID_0"
-_UNLABELLED = 65535  # feature id
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # about z: from left, up, front to right, down, front
+EXTRAS, ANTIALIASED = "sagesplat-labels", "sagesplat-antialiased"
+FEATURES = "_FEATURE_ID_0"
+UNLABELLED = 65535  # feature id
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # about z: from left, up, front to right, down, front
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ class _Asset:
     notes: dict[str, None] = field(default_factory=dict)  # as in Splat
     names: dict[int, str] = field(default_factory=dict)
     parents: dict[int, str] = field(default_factory=dict)
+    antialiased: list[bool] = field(default_factory=list)  # of primitives that say it
 
     def view(self, index: int) -> tuple[bytes, int, int, int]:
         """Buffer, first byte, size and stride (0: none) of a buffer view; ValueError if it is none."""
@@ -122,7 +124,7 @@ def read_gltf(path: Path) -> Splat:
                     raise ValueError("primitives or instances that share their positions too often")
                 parts.append(placed(part, _turned(matrix)))
         if not parts:
-            raise ValueError(f"no primitives with {_NAME}")
+            raise ValueError(f"no primitives with {NAME}")
     except DataError:
         raise
     except OSError as error:
@@ -132,7 +134,8 @@ def read_gltf(path: Path) -> Splat:
         text = short(error) if isinstance(error, ValueError) else short(repr(error))
         raise DataError(f"{path}: not a glTF with splats that is read ({text}); {_CURE}") from None
     g = parts[0] if len(parts) == 1 else concat(parts)
-    return Splat(g, "glTF", asset.names, parents=asset.parents, notes=tuple(asset.notes))
+    antialiased = any(asset.antialiased)
+    return Splat(g, "glTF", asset.names, antialiased, parents=asset.parents, notes=tuple(asset.notes))
 
 
 def _entry(entries: list[Any], index: Any) -> Any:
@@ -241,14 +244,14 @@ def _numbers(values: list[Any], count: int) -> np.ndarray:
 
 def _turned(matrix: np.ndarray) -> np.ndarray:
     """A node's matrix, from its own axes to COLMAP's."""
-    return np.block([[_HALF_TURN @ matrix[:3]], [np.eye(4)[3:]]])
+    return np.block([[HALF_TURN @ matrix[:3]], [np.eye(4)[3:]]])
 
 
 def _primitives(asset: _Asset, mesh: dict[str, Any]) -> Iterator[tuple[int, Gaussians]]:
     """The splats of a mesh in its own axes, and how many bytes no others should have."""
     for primitive in mesh["primitives"]:
         given = primitive.get("extensions", {})
-        splats = given.get(_NAME, {} if given.keys() & set(_SPZ) else None)
+        splats = given.get(NAME, {} if given.keys() & set(_SPZ) else None)
         if splats is None:
             continue
         _check(asset, splats)
@@ -256,7 +259,7 @@ def _primitives(asset: _Asset, mesh: dict[str, Any]) -> Iterator[tuple[int, Gaus
         packed = next((inside[name] for name in _SPZ if name in inside), None)
         if packed is not None:
             content, start, size, _ = asset.view(packed["bufferView"])
-            yield size, transformed(decode_spz(content[start : start + size], name="SPZ in it"), _HALF_TURN)
+            yield size, transformed(decode_spz(content[start : start + size], name="SPZ in it"), HALF_TURN)
         else:
             g = _attributes(asset, primitive["attributes"])
             yield 12 * len(g), _named(asset, primitive, g)
@@ -266,8 +269,8 @@ def _check(asset: _Asset, splats: dict[str, Any]) -> None:
     """ValueError for a kernel or colours that would be drawn wrongly; a note for hints that are not known."""
     if (kernel := splats.get("kernel", "ellipse")) != "ellipse":
         raise ValueError(f"splats of kernel {kernel!r:.60} are not supported")
-    if (colours := splats.get("colorSpace", _COLOURS[0])) not in _COLOURS:
-        raise ValueError(f"splats of colours {colours!r:.60} are not supported, {_COLOURS[0]} is")
+    if (colours := splats.get("colorSpace", COLOURS)) not in _COLOURS:
+        raise ValueError(f"splats of colours {colours!r:.60} are not supported, {COLOURS} is")
     for key, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
         if (hint := splats.get(key, usual)) != usual:
             asset.notes[f"{key} {short(repr(hint))} is not known; it is drawn as {usual}"] = None
@@ -276,7 +279,7 @@ def _check(asset: _Asset, splats: dict[str, Any]) -> None:
 def _attributes(asset: _Asset, attributes: dict[str, int]) -> Gaussians:
     def values(name: str, *kinds: str, unit: bool = False) -> np.ndarray:
         draft = _DRAFTS.get(name, "")
-        key = draft if draft in attributes and f"{_NAME}:{name}" not in attributes else f"{_NAME}:{name}"
+        key = draft if draft in attributes and f"{NAME}:{name}" not in attributes else f"{NAME}:{name}"
         key = name if name == "COLOR_0" else key
         if key not in attributes:
             raise ValueError(f"no attribute {key}")
@@ -286,18 +289,18 @@ def _attributes(asset: _Asset, attributes: dict[str, int]) -> Gaussians:
         return found
 
     means = asset.accessor(attributes["POSITION"], "VEC3")
-    degrees = [d for d in (1, 2, 3) if f"{_NAME}:SH_DEGREE_{d}_COEF_0" in attributes]
+    degrees = [d for d in (1, 2, 3) if f"{NAME}:SH_DEGREE_{d}_COEF_0" in attributes]
     if degrees != [1, 2, 3][: len(degrees)]:
         raise ValueError(f"harmonics of degrees {degrees}")
     coefficients = [f"SH_DEGREE_{d}_COEF_{i}" for d in degrees for i in range(2 * d + 1)]
     shN = np.empty((len(means), len(coefficients), 3), np.float32)
     for i, name in enumerate(coefficients):
         shN[:, i] = values(name, "VEC3")
-    if f"{_NAME}:OPACITY" not in attributes and "COLOR_0" in attributes:  # the first drafts
+    if f"{NAME}:OPACITY" not in attributes and "COLOR_0" in attributes:  # the first drafts
         colours = values("COLOR_0", "VEC3", "VEC4", unit=True)
         opacities = colours[:, 3] if colours.shape[1] == 4 else np.ones(len(means), np.float32)
         sh0 = (colours[:, None, :3] - np.float32(0.5)) / np.float32(C0)
-        asset.notes[f"colours and opacities are those of COLOR_0, as drafts of {_NAME} had them"] = None
+        asset.notes[f"colours and opacities are those of COLOR_0, as drafts of {NAME} had them"] = None
     else:
         opacities = values("OPACITY", "SCALAR", unit=True)[:, 0]
         sh0 = values("SH_DEGREE_0_COEF_0", "VEC3")[:, None]
@@ -319,7 +322,7 @@ def _log_scales(asset: _Asset, scales: np.ndarray) -> np.ndarray:
             return np.log(scales)
     if (largest := float(np.nanmax(scales))) > _MOST_LOG:
         raise ValueError(f"scales from {float(np.nanmin(scales)):.3g} to {largest:.3g}")
-    asset.notes[f"scales are logarithms, as drafts of {_NAME} had them"] = None
+    asset.notes[f"scales are logarithms, as drafts of {NAME} had them"] = None
     return scales
 
 
@@ -336,16 +339,19 @@ def _logits(asset: _Asset, opacities: np.ndarray) -> np.ndarray:
 def _named(asset: _Asset, primitive: dict[str, Any], g: Gaussians) -> Gaussians:
     """The Gaussians with the labels that `write_glb` wrote, if there are any."""
     extras = primitive.get("extras")
-    if not isinstance(extras, dict) or _EXTRAS not in extras or _FEATURES not in primitive["attributes"]:
+    if not isinstance(extras, dict):
         return g
-    ids = asset.accessor(primitive["attributes"][_FEATURES], "SCALAR")[:, 0]
-    if len(ids) != len(g) or not ((ids >= 0) & (ids <= _UNLABELLED) & (ids == np.floor(ids))).all():
-        raise ValueError(f"{_FEATURES} of {len(ids)} values")
-    ids = np.where(ids == _UNLABELLED, -1, ids)
+    asset.antialiased.append(extras.get(ANTIALIASED) is True)
+    if EXTRAS not in extras or FEATURES not in primitive["attributes"]:
+        return g
+    ids = asset.accessor(primitive["attributes"][FEATURES], "SCALAR")[:, 0]
+    if len(ids) != len(g) or not ((ids >= 0) & (ids <= UNLABELLED) & (ids == np.floor(ids))).all():
+        raise ValueError(f"{FEATURES} of {len(ids)} values")
+    ids = np.where(ids == UNLABELLED, -1, ids)
     if (ids > 32767).any():
-        raise ValueError(f"{_FEATURES} up to {ids.max():g}")
+        raise ValueError(f"{FEATURES} up to {ids.max():g}")
     g = replace(g, label_ids=torch.from_numpy(ids.astype(np.int16)))
-    splat = labelled(Splat(g, "glTF"), json.dumps(extras[_EXTRAS]).encode())
+    splat = labelled(Splat(g, "glTF"), json.dumps(extras[EXTRAS]).encode())
     asset.names.update(splat.names)
     asset.parents.update(splat.parents)
     return splat.gaussians

@@ -68,6 +68,7 @@ class SplatWriter:
     write: WriteScene | None = None
     write_levels: WriteLevels | None = None
     antialiases: bool = True  # whether viewers draw a file as it says that it was trained
+    sh_degree: int = 3  # the highest that the format holds
 
 
 def cleaned(splat: Splat, name: str) -> Splat:

@@ -22,6 +22,8 @@ from sagesplat.formats.increments import (
     write_increments,
 )
 from sagesplat.formats.lod_meta import LOD_META
+from sagesplat.formats.ply import WRITER as PLY_WRITER
+from sagesplat.formats.ply import write_ply
 from sagesplat.formats.splat import WriteLevels
 from sagesplat.formats.splats import write_splat, writer_of
 from sagesplat.raster import device_of, rasterize
@@ -74,6 +76,7 @@ def export_scene(
     levels: Sequence[int] = (),
     rasterize_mode: RasterizeMode | None = None,
     without: Sequence[str] = (),
+    labels_inside: bool = False,
 ) -> int:
     """Write a level or a composition, whole or some categories, in the format of the path's name.
 
@@ -81,9 +84,12 @@ def export_scene(
     is left out leaves holes, which an event names.
 
     `rasterize_mode`: how the file will be drawn; None: `classic` for a PLY, else as the run was trained.
-    `lod-meta.json` gets `levels`, or all there are, as levels of detail. Returns the number of Gaussians.
+    `lod-meta.json` gets `levels`, or all there are, as levels of detail. `labels_inside`: a PLY has the labels
+    as a property, not beside it. Returns the number of Gaussians.
     """
     writer = writer_of(path)
+    if labels_inside and writer is not PLY_WRITER:
+        raise RunError(f"{path}: --labels-inside is for .ply; leave it out")
     if rasterize_mode == "antialiased" and not job.antialiased:
         raise RunError(f"{job.run.path}: trained without antialiasing; leave out --rasterize-mode")
     if rasterize_mode == "classic" and writer.write_levels:
@@ -109,11 +115,16 @@ def export_scene(
     g = whole.of_labels(wanted)
     if gone:
         job.emit(Warned(_holes(job, whole, g, without)))
+    if g.sh_degree > writer.sh_degree and bool(g.shN.any()):
+        job.emit(Warned(f"{path}: the format holds no harmonics, which are left out"))
     mode = rasterize_mode or ("antialiased" if writer.antialiases else "classic")
-    if mode == "classic":
-        write_splat(path, classic(job, g), job.names(), parents=job.parents_by_id)
+    antialiased = mode == "antialiased" and job.antialiased
+    g = g if antialiased else classic(job, g)
+    kept = {"parents": job.parents_by_id, "antialiased": antialiased}
+    if labels_inside:
+        write_ply(path, g, job.names(), **kept, labels_inside=True)
     else:
-        write_splat(path, g, job.names(), parents=job.parents_by_id, antialiased=job.antialiased)
+        write_splat(path, g, job.names(), **kept)
     return len(g)
 
 
