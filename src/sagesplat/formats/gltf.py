@@ -157,9 +157,6 @@ def _asset(path: Path) -> _Asset:
     contents = [found.get(buffer.get("uri")) for buffer in buffers]
     if buffers and "uri" not in buffers[0] and not _falls_back(buffers[0]):
         contents[0] = binary  # the chunk is of the first buffer alone
-    for number, (buffer, content) in enumerate(zip(buffers, contents, strict=True)):
-        if content is not None and len(content) < buffer.get("byteLength", 0):
-            raise ValueError(f"{len(content)} of the {buffer['byteLength']} bytes of buffer {number}")
     return _Asset(document, contents)
 
 

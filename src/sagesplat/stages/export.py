@@ -83,9 +83,9 @@ def export_scene(
     `labels` (none: all) and `without` name categories or instances; a category means its instances too. What
     is left out leaves holes, which an event names.
 
-    `rasterize_mode`: how the file will be drawn; None: `classic` for a PLY, else as the run was trained.
-    `lod-meta.json` gets `levels`, or all there are, as levels of detail. `labels_inside`: a PLY has the labels
-    as a property, not beside it. Returns the number of Gaussians.
+    `rasterize_mode`: how the file will be drawn; None: as the run was trained where the format says so, else
+    `classic`. `lod-meta.json` gets `levels`, or all there are, as levels of detail. `labels_inside`: a PLY
+    has the labels as a property, not beside it. Returns the number of Gaussians.
     """
     writer = writer_of(path)
     if labels_inside and writer is not PLY_WRITER:
