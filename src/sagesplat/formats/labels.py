@@ -75,7 +75,7 @@ def as_json(
     counts: dict[int, int] = {}
     for label, size in zip(labels, sizes, strict=True):
         counts[label] = counts.get(label, 0) + size
-    named = {i: repaired(names[i], f"category {i}") for i in sorted(counts) if i in names}
+    named = {i: repaired(names[i], f"category {i}") for i in sorted(counts) if i in names and i >= 0}
     document: dict[str, Any] = {"format": _FORMAT, "version": 1, "names": named, "counts": counts}
     if of := {i: repaired(parents[i], f"category of {i}") for i in named if i in parents}:
         document["parents"] = of
