@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,7 @@ from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.sh import BASES
 from sagesplat.formats.increments import (
     INDEX,
     FileFormat,
@@ -59,8 +61,11 @@ def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]
     streams = any(one.format == "stream" for one in listed)
     g = read_increments(job.run.increments, listed) if streams else ladder.gaussians
     antialiased = job.antialiased and kind != "ply"
+    if kind == "ply":  # in the published layout, with all harmonics
+        g = classic(job, g)
+        g = replace(g, shN=torch.nn.functional.pad(g.shN, (0, 0, 0, BASES[-1] - g.shN.shape[1])))
     return write_increments(
-        folder, classic(job, g) if kind == "ply" else g, ladder.sizes, job.names(), replaces=ladder.replaces,
+        folder, g, ladder.sizes, job.names(), replaces=ladder.replaces,
         kind=kind, fine=ladder.levels if streams else (),
         antialiased=antialiased,
     )  # fmt: skip
