@@ -317,9 +317,9 @@ def _gaussians(table: _Table) -> Gaussians:
     columns, labels = table.columns, table.labels
     bases = (len(columns) - 14) // 3
     rest = columns[6:-8].reshape(3, bases, columns.shape[1])  # all red, all green, all blue
-    bases = next(
-        (n for n, below in zip(BASES[:0:-1], BASES[-2::-1], strict=True) if rest[:, below:n].any()), 0
-    )
+    steps = zip(BASES[:0:-1], BASES[-2::-1], strict=True)
+    with np.errstate(invalid="ignore"):  # NaN of some kinds
+        bases = next((most for most, below in steps if rest[:, below:most].any()), 0)
     rest = rest[:, :bases]
 
     def rows(part: np.ndarray) -> torch.Tensor:
