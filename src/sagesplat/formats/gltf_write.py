@@ -17,7 +17,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.core.transform import transformed
 from sagesplat.formats.gltf import ANTIALIASED, COLOURS, EXTRAS, FEATURES, HALF_TURN, NAME, UNLABELLED
-from sagesplat.formats.labels import as_json
+from sagesplat.formats.labels import as_document
 from sagesplat.formats.sog_write import GENERATOR
 from sagesplat.formats.splat import SplatWriter, check_writable
 from sagesplat.io.files import atomic_path
@@ -54,7 +54,7 @@ def write_glb(
     if bool((g.label_ids >= 0).any()):
         ids = g.label_ids.numpy().astype(np.float32)[:, None]
         columns[FEATURES] = np.where(ids < 0, np.float32(UNLABELLED), ids)
-        extras[EXTRAS] = json.loads(as_json(g.label_ids, names or {}, parents or {}, runs=False))
+        extras[EXTRAS] = as_document(g.label_ids, names or {}, parents or {}, runs=False)
         count = len(torch.unique(g.label_ids[g.label_ids >= 0]))
         features = {"label": "category", "attribute": 0, "featureCount": count, "nullFeatureId": UNLABELLED}
     content, views, accessors = bytearray(), list[dict[str, Any]](), list[dict[str, Any]]()

@@ -71,6 +71,17 @@ def as_json(
     runs: bool = True,
 ) -> bytes:
     """The labels of rows, the names of those that occur, and the categories of the instances among them."""
+    return json.dumps(as_document(label_ids, names, parents, runs=runs), ensure_ascii=False).encode()
+
+
+def as_document(
+    label_ids: Int16[Tensor, " N"],
+    names: Mapping[int, str],
+    parents: Mapping[int, str] = NO_PARENTS,
+    *,
+    runs: bool = True,
+) -> dict[str, Any]:
+    """What `as_json` writes."""
     labels, sizes = (v.tolist() for v in torch.unique_consecutive(label_ids, return_counts=True))
     counts: dict[int, int] = {}
     for label, size in zip(labels, sizes, strict=True):
@@ -81,7 +92,7 @@ def as_json(
         document["parents"] = of
     if runs:
         document["runs"] = list(zip(labels, sizes, strict=True))
-    return json.dumps(document, ensure_ascii=False).encode()
+    return document
 
 
 def with_labels(splat: Splat, path: Path) -> Splat:
