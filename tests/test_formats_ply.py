@@ -57,7 +57,15 @@ def split(path: Path) -> tuple[bytes, bytes]:
 
 
 def foreign(path: Path, columns: dict[str, np.ndarray], order: str = "<", extra: str = "") -> None:
-    kinds = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar", "u2": "ushort", "u4": "uint"}
+    kinds = {
+        "f2": "half",
+        "f4": "float",
+        "f8": "double",
+        "i4": "int",
+        "u1": "uchar",
+        "u2": "ushort",
+        "u4": "uint",
+    }
     names = "".join(f"property {kinds[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
     form = "binary_little_endian" if order == "<" else "binary_big_endian"
     count = len(next(iter(columns.values())))
@@ -157,6 +165,8 @@ def test_other_tools(tmp_path, bases, order):
     g = make(50, bases)
     columns = {"red": np.zeros(50, np.uint8), **columns_of(g)}
     columns["opacity"] = columns["opacity"].astype(np.float64)
+    g.quats[:] = g.quats.half()
+    columns |= {f"rot_{i}": g.quats[:, i].numpy().astype(np.float16) for i in range(4)}
     faces = "element face 3\nproperty list uchar int vertex_indices\nproperty float x\n"
     foreign(tmp_path / "a.ply", columns, order, faces)
     read = read_ply(tmp_path / "a.ply")

@@ -268,6 +268,8 @@ def _check(asset: _Asset, splats: dict[str, Any]) -> None:
         raise ValueError(f"splats of kernel {kernel!r:.60} are not supported")
     if (colours := splats.get("colorSpace", COLOURS)) not in _COLOURS:
         raise ValueError(f"splats of colours {colours!r:.60} are not supported, {COLOURS} is")
+    for name in splats.get("extensions", {}).keys() - set(_SPZ):
+        asset.notes[f"extension {short(name)} of the splats is not known, and not read"] = None
     for key, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
         if (hint := splats.get(key, usual)) != usual:
             asset.notes[f"{key} {short(repr(hint))} is not known; it is drawn as {usual}"] = None
