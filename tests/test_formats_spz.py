@@ -305,6 +305,7 @@ BODY = bytes(20)
     ("content", "message"),
     [
         (b"ply\nformat", "not gzip, or damaged"),
+        (pack(b"ply\nformat binary_little_endian 1.0\n"), "not an SPZ file; unpack it with gunzip"),
         (pack(header(1, version=5) + BODY), "SPZ version 5 is not supported"),
         (pack(header(1, version=1) + BODY), "not the 1 Gaussians announced"),
         (pack(header(1, flags=4) + BODY), "an LOD tree"),

@@ -1,5 +1,7 @@
 """What SPZ files wrap around the bytes of the attributes: gzip in versions 1 to 3, zstd in version 4.
 
+Versions 1 to 3 may end with extension records, as version 4 has them.
+
 Version 4, little endian: a header of 32 bytes (magic, version, count as uint32; SH degree, fractional bits,
 flags, number of streams; offset of the table, uint32; 12 zeros), extension records (type and size as uint32,
 content), the table (packed and unpacked size of each stream as uint64), and a zstd frame for each attribute.
@@ -117,7 +119,8 @@ def _widths(version: int, degree: int) -> tuple[int, ...]:
 def _read_header(name: str, header: bytes) -> tuple[int, int, int, int, int]:
     """Version, count, SH degree, fractional bits and flags. DataError for an unsupported header."""
     if len(header) < HEADER.size or not header.startswith(MAGIC):
-        raise DataError(f"{name}: not an SPZ file; give an .spz of version 1 to 4")
+        cure = "unpack it with gunzip" if header.startswith(b"ply") else "give an .spz of version 1 to 4"
+        raise DataError(f"{name}: not an SPZ file; {cure}")
     _, version, count, degree, bits, flags, _ = HEADER.unpack(header[: HEADER.size])
     if degree > 4 or bits > MAX_BITS:
         raise DataError(
