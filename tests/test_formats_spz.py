@@ -344,6 +344,7 @@ def test_axes_are_those_that_the_file_names(tmp_path, value):
     )
     splat = read_spz_splat(tmp_path / "a.spz")
     stored, read = decode_spz(content, frame="rdf"), splat.gaussians
+    assert bool(splat.notes) == (value in (9, 10, 15, 16))  # where SPZ's library has another sign
     ours = {"r": [1, 0, 0], "l": [-1, 0, 0], "d": [0, 1, 0], "u": [0, -1, 0], "f": [0, 0, 1], "b": [0, 0, -1]}
     matrix = np.eye(4)
     matrix[:3, :3] = np.array([ours[axis] for axis in AXES[value - 1]]).T

@@ -61,6 +61,8 @@ _SMALLER = 511 * 2**0.5  # a quaternion's second largest component is at most sq
 _LABELS = 0x53470001  # type of our extension: `formats/labels.py`
 _AXES = 0xADBE0003  # type of Adobe's extension: its content is a row of _FRAMES
 _FRAMES: tuple[Frame, ...] = ("rub", "ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf")
+_AMBIGUOUS = (9, 10, 15, 16)  # axes that the format's library turns otherwise than their names say
+_UNSURE = "its axes are read by their names; if it is upside down, adopt it with --up y"
 _QUARTER_TURN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of axes 9 to 16, such as right, front, up
 
 
@@ -211,7 +213,7 @@ def read_spz_splat(path: Path, *, frame: Frame = "rub") -> Splat:
     """
     content = _content(path)
     packed = unpacked(str(path), content)
-    turned = False
+    turned, value = False, 0
     if (axes := packed.extensions.get(_AXES)) is not None:
         value = int.from_bytes(axes, "little")
         if len(axes) != 4 or value > 16:
@@ -219,8 +221,9 @@ def read_spz_splat(path: Path, *, frame: Frame = "rub") -> Splat:
         turned = value > 8  # z is up or down; after a quarter turn y is
         frame = _FRAMES[(value - 9 ^ 6) + 1 if turned else value]
     g = _gaussians(packed, -1, frame, turned=turned)
-    notes = ("harmonics of degree 4 are left out; degrees 0 to 3 are kept",) if packed.degree > 3 else ()
-    splat = Splat(g, f"SPZ {packed.version}", antialiased=packed.antialiased, notes=notes)
+    notes = ["harmonics of degree 4 are left out; degrees 0 to 3 are kept"] * (packed.degree > 3)
+    notes += [_UNSURE] * (turned and value in _AMBIGUOUS)
+    splat = Splat(g, f"SPZ {packed.version}", antialiased=packed.antialiased, notes=tuple(notes))
     try:
         return labelled(splat, packed.extensions[_LABELS]) if _LABELS in packed.extensions else splat
     except ValueError as error:
