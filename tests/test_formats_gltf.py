@@ -2,6 +2,7 @@
 
 import base64
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.transform import transformed
-from sagesplat.formats.splats import read_splat
+from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.formats.spz import decode_spz, encode_spz
 from tests.conftest import random_gaussians
 from tests.fuzz.readers.foreign_splats import glb, gltf
@@ -105,6 +106,187 @@ def test_an_spz_inside(tmp_path):
     near(splat.gaussians, decode_spz(encode_spz(g)), atol=1e-6)
 
 
+def covariances(g: Any) -> np.ndarray:
+    q = (g.quats / g.quats.norm(dim=1, keepdim=True)).double().numpy()
+    w, x, y, z = q.T
+    rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)]]
+    rows += [[2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)]]
+    rows += [[2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+    axes = np.moveaxis(np.array(rows), -1, 0) * g.log_scales.double().exp().numpy()[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize("scale", [[2, 2, 3], [1, 1, -1], [-2, 1, 0.5]])
+def test_nodes_that_mirror_or_stretch(tmp_path, scale):
+    from sagesplat.core.sh import bases
+
+    g = random_gaussians(30, seed=5)
+    turn = {"rotation": [0, 0, 0.5**0.5, 0.5**0.5], "translation": [1, 2, 3]}
+    read = read_splat(put(tmp_path / "a.glb", *gltf(g, scale=scale, **turn))).gaussians
+    rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    linear = HALF_TURN @ rotation @ np.diag(scale)
+    np.testing.assert_allclose(read.means, g.means.numpy() @ linear.T + HALF_TURN @ [1, 2, 3], atol=1e-5)
+    np.testing.assert_allclose(covariances(read), linear @ covariances(g) @ linear.T, atol=1e-5)
+    direction = np.array([0.3, 0.8, -((1 - 0.73) ** 0.5)])
+    turned = HALF_TURN @ rotation @ np.diag(np.sign(scale)) @ direction
+    before, after = (np.array(bases(*d)[1:]) for d in (direction, turned))
+    np.testing.assert_allclose(
+        np.einsum("k,nkc->nc", after, read.shN), np.einsum("k,nkc->nc", before, g.shN), atol=1e-5
+    )
+
+
+def test_a_mesh_in_several_nodes(tmp_path):
+    g = random_gaussians(20, degree=1, seed=6)
+    document, content = gltf(g)
+    document["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
+    document["scenes"] = [{"nodes": [0, 1]}]
+    read = read_splat(put(tmp_path / "a.glb", document, content)).gaussians
+    means = transformed(g, HALF_TURN).means
+    expected = torch.cat([means, means + torch.tensor([-5.0, 0, 0])])
+    assert sorted(read.means.tolist()) == sorted(expected.tolist())
+
+
+def test_only_the_first_buffer_is_the_binary_chunk(tmp_path):
+    document, content = gltf(random_gaussians(9, degree=0))
+    for view in document["bufferViews"]:
+        view["buffer"] = 1
+        view["extensions"] = {"KHR_meshopt_compression": {"buffer": 0}}
+    fallback = {"byteLength": len(content), "extensions": {"KHR_meshopt_compression": {"fallback": True}}}
+    document["buffers"].append(fallback)
+    with pytest.raises(DataError, match="buffer 1 has no content: KHR_meshopt_compression"):
+        read_splat(put(tmp_path / "a.glb", document, content))
+    (tmp_path / "buffers").mkdir()
+    (tmp_path / "buffers" / "b.bin").write_bytes(content)
+    fallback["uri"] = "buffers/b.bin"  # a fallback that is there
+    assert len(read_splat(put(tmp_path / "a.glb", document, content)).gaussians) == 9
+
+
+def values(document: dict[str, Any], content: bytes, name: str) -> np.ndarray:
+    """A writable view of a float attribute of a `bytearray`."""
+    at = document["meshes"][0]["primitives"][0]["attributes"][name]
+    view = document["bufferViews"][document["accessors"][at]["bufferView"]]
+    return np.frombuffer(content, "<f4", view["byteLength"] // 4, view["byteOffset"])
+
+
+@pytest.mark.parametrize("shift", [0, 3])
+def test_logarithms_of_scales_and_logits(tmp_path, shift):
+    g = random_gaussians(40, degree=0, seed=7)
+    g = replace(g, log_scales=g.log_scales + shift)
+    assert (g.log_scales < 0).any()
+    document, content = gltf(g)
+    content = bytearray(content)
+    values(document, content, "KHR_gaussian_splatting:SCALE")[:] = g.log_scales.numpy().ravel()
+    splat = read_splat(put(tmp_path / "a.glb", document, content))
+    near(splat.gaussians, transformed(g, HALF_TURN))
+    assert splat.notes == ("scales are logarithms, as drafts of KHR_gaussian_splatting had them",)
+    values(document, content, "KHR_gaussian_splatting:OPACITY")[:] = g.logit_opacities.numpy()
+    splat = read_splat(put(tmp_path / "a.glb", document, content))
+    near(splat.gaussians, transformed(g, HALF_TURN))
+    assert "opacities are logits: they are not between 0 and 1" in splat.notes
+    values(document, content, "KHR_gaussian_splatting:SCALE")[0] = 1e9
+    with pytest.raises(DataError, match="scales from"):
+        read_splat(put(tmp_path / "a.glb", document, content))
+
+
+def test_attributes_of_the_first_drafts(tmp_path):
+    g = random_gaussians(12, degree=0, seed=8)
+    document, content = gltf(g)
+    primitive = document["meshes"][0]["primitives"][0]
+    old = primitive["attributes"]
+    colours = np.concatenate([g.sh0[:, 0] * 0.28209479 + 0.5, g.logit_opacities.sigmoid()[:, None]], 1)
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(content), "byteLength": 16 * 12})
+    document["accessors"].append({"bufferView": 5, "count": 12, "type": "VEC4", "componentType": 5126})
+    primitive["attributes"] = {"POSITION": old["POSITION"], "COLOR_0": 5}
+    primitive["attributes"] |= {
+        f"_{key}": old[f"KHR_gaussian_splatting:{key}"] for key in ("ROTATION", "SCALE")
+    }
+    splat = read_splat(put(tmp_path / "a.glb", document, content + colours.astype("<f4").tobytes()))
+    near(splat.gaussians, transformed(g, HALF_TURN))
+    assert splat.notes == (
+        "colours and opacities are those of COLOR_0, as drafts of KHR_gaussian_splatting had them",
+    )
+    document, content = with_spz(g)
+    inside = {"KHR_spz_gaussian_splats_compression": {"bufferView": 0}}
+    document["meshes"][0]["primitives"][0]["extensions"] = inside
+    document["extensionsRequired"] = list(inside)
+    near(read_splat(put(tmp_path / "a.glb", document, content)).gaussians, decode_spz(encode_spz(g)))
+
+
+def test_quantised_attributes(tmp_path):
+    """Positions of 16 bits with a node that scales them (KHR_mesh_quantization), and the others."""
+    name, count, rng = "KHR_gaussian_splatting", 30, np.random.default_rng(1)
+    positions = rng.integers(0, 65536, (count, 4), np.uint16)  # of 8 bytes a row
+    rotations = rng.integers(-32767, 32768, (count, 4), np.int16)
+    scales = rng.integers(1, 256, (count, 4), np.uint8)
+    opacities = rng.integers(1, 65535, (count, 2), np.uint16)
+    colours = rng.normal(size=(count, 3)).astype("<f4")
+    content, views, accessors = b"", [], []
+    for column, kind, component in (
+        (positions, "VEC3", 5123), (rotations, "VEC4", 5122), (scales, "VEC3", 5121),
+        (opacities, "SCALAR", 5123), (colours, "VEC3", 5126),
+    ):  # fmt: skip
+        views.append({"buffer": 0, "byteOffset": len(content), "byteLength": column.nbytes})
+        views[-1]["byteStride"] = column.nbytes // count
+        accessors.append({"bufferView": len(accessors), "count": count, "type": kind})
+        accessors[-1] |= {"componentType": component, "normalized": component != 5126}
+        content += column.tobytes()
+    keys = ["POSITION", f"{name}:ROTATION", f"{name}:SCALE", f"{name}:OPACITY", f"{name}:SH_DEGREE_0_COEF_0"]
+    document = gltf(random_gaussians(2))[0] | {"bufferViews": views, "accessors": accessors}
+    document["meshes"][0]["primitives"][0]["attributes"] = {key: i for i, key in enumerate(keys)}
+    document["extensionsRequired"] = ["KHR_mesh_quantization"]
+    document["nodes"] = [{"mesh": 0, "scale": [8, 8, 8], "translation": [-4, -4, -4]}]
+    document["buffers"] = [{"byteLength": len(content)}]
+    g = read_splat(put(tmp_path / "a.glb", document, content)).gaussians
+    expected = (positions[:, :3] / 65535 * 8 - 4) @ HALF_TURN.T
+    np.testing.assert_allclose(g.means, expected, atol=1e-5)
+    np.testing.assert_allclose(g.log_scales.exp(), scales[:, :3] / 255 * 8, rtol=1e-5)
+    np.testing.assert_allclose(g.logit_opacities.sigmoid(), opacities[:, 0] / 65535, atol=1e-6)
+
+
+def plainly(path: Path) -> dict[str, np.ndarray]:
+    """The attributes of the first primitive of a .glb, by the words of glTF's specification alone."""
+    content = path.read_bytes()
+    assert content[:8] == b"glTF\2\0\0\0"
+    assert int.from_bytes(content[8:12], "little") == len(content)
+    size = int.from_bytes(content[12:16], "little")
+    document, start = json.loads(content[20 : 20 + size]), 28 + size
+    assert int.from_bytes(content[20 + size : 24 + size], "little") == document["buffers"][0]["byteLength"]
+    found = {}
+    for name, at in document["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = document["accessors"][at]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        column = np.frombuffer(content, dtype, accessor["count"] * width, start + view["byteOffset"])
+        found[name] = column.reshape(-1, width)
+    return found
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_a_glb_is_written_as_the_extension_has_it(tmp_path, degree):
+    g = random_gaussians(25, degree=degree, seed=9)
+    labels = (torch.arange(25) // 10 - 1).to(torch.int16) * 200
+    labels[:10] = -1
+    g = replace(g, label_ids=labels)
+    write_splat(
+        tmp_path / "a.glb", g, {200: "chair 1", 0: "Wand ☘"}, parents={200: "chair"}, antialiased=True
+    )
+    name, there = "KHR_gaussian_splatting", plainly(tmp_path / "a.glb")
+    np.testing.assert_allclose(there["POSITION"], g.means.numpy() * [-1, -1, 1])
+    np.testing.assert_allclose(there[f"{name}:SCALE"], g.log_scales.exp(), rtol=1e-6)
+    np.testing.assert_allclose(there[f"{name}:OPACITY"][:, 0], g.logit_opacities.sigmoid(), rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(there[f"{name}:ROTATION"], axis=1), 1, atol=1e-6)
+    assert len([key for key in there if ":SH_" in key]) == (degree + 1) ** 2
+    assert there["_FEATURE_ID_0"][:, 0].tolist() == [65535] * 10 + [0] * 10 + [200] * 5
+    splat = read_splat(tmp_path / "a.glb")
+    near(splat.gaussians, g)
+    assert torch.equal(splat.gaussians.label_ids, labels)
+    assert splat.names == {0: "Wand ☘", 200: "chair 1"}
+    assert splat.parents == {200: "chair"}
+    assert splat.antialiased
+    assert not splat.notes
+
+
 def change(document: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
     """A copy with `value` at a path such as "nodes.0.matrix"."""
     document = json.loads(json.dumps(document))
@@ -119,8 +301,12 @@ def change(document: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("nodes.0.scale", [1, 2, 1], "scales its axes differently"),
-        ("nodes.0.scale", [-1, 1, 1], "mirrors"),
+        ("nodes.0.scale", [1, 0, 1], "flattens"),
+        ("nodes.0.extensions", {"EXT_mesh_gpu_instancing": {}}, "EXT_mesh_gpu_instancing"),
+        ("extensionsRequired", ["VENDOR_new"], "requires VENDOR_new, not supported"),
+        ("extensionsRequired", ["EXT_meshopt_compression"], "requires EXT_meshopt_compression"),
+        ("buffers", [], "entry 0 of 0"),
+        ("accessors.0", {"count": 4, "type": "VEC3", "componentType": 5126}, "without a buffer view"),
         ("nodes.0.children", [0], "in its tree twice"),
         ("nodes.0.translation", [10**400, 0, 0], "OverflowError"),
         ("accessors.0.count", 10**9, "1000000000 values, more than fit"),
@@ -132,8 +318,9 @@ def change(document: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
         (
             "meshes.0.primitives.0.extensions.KHR_gaussian_splatting.colorSpace",
             "lin_rec709_display",
-            "not supported",
+            "colours 'lin_rec709_display' are not supported",
         ),
+        ("meshes.0.primitives.0.extensions.KHR_gaussian_splatting.kernel", "cube", "kernel 'cube'"),
         ("meshes.0.primitives.0.attributes", {"POSITION": 0}, "no attribute KHR_gaussian_splatting:OPACITY"),
     ],
 )

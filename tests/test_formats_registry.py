@@ -13,14 +13,14 @@ from sagesplat.cli.help import help_of
 from sagesplat.core.errors import DataError
 from sagesplat.formats.registry import READERS, WRITERS
 from sagesplat.formats.splat import SplatReader, SplatWriter
-from sagesplat.formats.splats import read_splat, write_splat
+from sagesplat.formats.splats import read_splat, write_splat, writer_of
 from tests.conftest import random_gaussians
 
 ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("suffix", [".ply", ".spz", ".SOG"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".SOG", ".glb", ".compressed.PLY"])
 def test_categories_and_flags_are_kept(tmp_path, suffix, antialiased):
     g = random_gaussians(60, degree=1)
     g = replace(g, label_ids=(torch.arange(60) // 25 - 1).to(torch.int16))
@@ -36,11 +36,45 @@ def test_categories_and_flags_are_kept(tmp_path, suffix, antialiased):
 
 
 def test_other_names_are_refused(tmp_path):
-    with pytest.raises(DataError, match=r"a\.glb: .* use \.ply, \.spz, \.sog or lod-meta\.json"):
-        write_splat(tmp_path / "a.glb", random_gaussians(3))
-    with pytest.raises(DataError, match=r"several levels; name a \.ply, \.spz or \.sog"):
+    known = r"\.ply, \.spz, \.sog, \.glb, \.compressed\.ply, \.splat"
+    with pytest.raises(DataError, match=rf"a\.ksplat: .* use {known} or lod-meta\.json"):
+        write_splat(tmp_path / "a.ksplat", random_gaussians(3))
+    with pytest.raises(DataError, match=r"several levels; name a \.ply, .* or \.splat"):
         write_splat(tmp_path / "lod-meta.json", random_gaussians(3))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("a.compressed.ply", "compressed PLY"), ("a.splat", ".splat"), ("b.compressed", "")]
+)
+def test_the_name_says_the_format(tmp_path, name, kind):
+    if not kind:
+        with pytest.raises(DataError, match="says no format"):
+            writer_of(tmp_path / name)
+        return
+    g = random_gaussians(300, degree=1)
+    g = replace(g, label_ids=(torch.arange(300) % 3 - 1).to(torch.int16))
+    write_splat(tmp_path / name, g, {0: "tree", 1: "sky"}, parents={1: "sky-other"})
+    splat = read_splat(tmp_path / name)
+    assert splat.kind == kind
+    assert (splat.names, splat.parents) == ({0: "tree", 1: "sky"}, {1: "sky-other"})
+    rows = torch.cdist(g.means, splat.gaussians.means).argmin(1)
+    assert rows.unique().numel() == 300
+    back = splat.gaussians.select(rows)
+    assert torch.equal(back.label_ids, g.label_ids)
+    ranges = g.means.max(0).values - g.means.min(0).values
+    steps = ranges / 1023 if kind == "compressed PLY" else torch.zeros(3)
+    assert ((back.means - g.means).abs() <= steps).all()
+    torch.testing.assert_close(back.log_scales, g.log_scales, atol=5e-3, rtol=0)
+    torch.testing.assert_close(
+        back.logit_opacities.sigmoid(), g.logit_opacities.sigmoid(), atol=0.51 / 255, rtol=0
+    )
+    colours, read = ((some.sh0 * 0.28209479 + 0.5).clamp(0, 1) for some in (g, back))
+    torch.testing.assert_close(read, colours, atol=0.02, rtol=0)
+    turns = torch.nn.functional.normalize(g.quats), torch.nn.functional.normalize(back.quats)
+    assert ((turns[0] * turns[1]).sum(1).abs() > 0.9995).all()
+    if kind == "compressed PLY":
+        torch.testing.assert_close(back.shN, g.shN.clamp(-4, 4), atol=1 / 32 + 1e-6, rtol=0)
 
 
 # The file that docs/architecture.md, "How to add a file format", asks for.

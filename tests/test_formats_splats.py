@@ -110,7 +110,7 @@ def test_other_files_are_refused_in_one_line(tmp_path):
     (tmp_path / "d.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
     )
-    refused(tmp_path / "d.ply", "binary_little_endian")
+    refused(tmp_path / "d.ply", "13 splat properties missing (y, z, f_dc_0, f_dc_1, ...)")
     (tmp_path / "e.splat").write_bytes(bytes(33))
     refused(tmp_path / "e.splat", "1 bytes after 1 Gaussians")
     refused(tmp_path / "none.ply", "No such file")

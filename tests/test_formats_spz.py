@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.core.sh import bases
+from sagesplat.core.transform import placed
 from sagesplat.formats.quantisation import (
     COLOUR_STEP,
     PER_COLOUR,
@@ -34,6 +36,7 @@ from sagesplat.formats.spz import (
     write_spz,
 )
 from sagesplat.raster import rasterize
+from sagesplat.raster.reference import rotation_matrices
 from sagesplat.scene.scene import Camera
 from tests.conftest import damage, pinhole, random_gaussians
 
@@ -302,9 +305,13 @@ BODY = bytes(20)
     ("content", "message"),
     [
         (b"ply\nformat", "not gzip, or damaged"),
-        (pack(header(1, version=1) + BODY), "SPZ version 1 is not supported"),
+        (pack(b"ply\nformat binary_little_endian 1.0\n"), "not an SPZ file; unpack it with gunzip"),
+        (pack(header(1, version=5) + BODY), "SPZ version 5 is not supported"),
+        (pack(header(1, version=1) + BODY), "not the 1 Gaussians announced"),
+        (pack(header(1, flags=4) + BODY), "an LOD tree"),
+        (pack(header(1, flags=2) + BODY + b"1234567"), "damaged"),
         (header(MAX_COUNT, version=4) + bytes(16), "10000000 Gaussians announced, more than fit"),
-        (pack(header(1, degree=4) + BODY), "SH degree 4"),
+        (pack(header(1, degree=5) + BODY), "SH degree 5"),
         (pack(header(1) + BODY[1:]), "not the 1 Gaussians announced"),
         (pack(header(10) + bytes(10**7)), "not the 10 Gaussians announced"),  # a bomb: read no further
     ],
@@ -314,6 +321,76 @@ def test_other_files_are_refused(tmp_path, content, message):
     (tmp_path / "a.spz").write_bytes(content)
     with pytest.raises(DataError, match=rf"a\.spz: .*{message}"):
         read_spz(tmp_path / "a.spz")
+
+
+def seen(g: Gaussians, direction: np.ndarray) -> np.ndarray:
+    """Colours [N, 3] in a direction, without the constant one."""
+    return np.einsum("k,nkc->nc", np.array(bases(*direction)[1 : 1 + g.shN.shape[1]]), g.shN)
+
+
+# Of the extension SPZ_ADOBE_coordinate_system: where x, y and z point to, from 1 on.
+AXES = ["ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"]
+AXES += ["lfd", "rfd", "lfu", "rfu", "lbd", "rbd", "lbu", "rbu"]
+
+
+@pytest.mark.parametrize("value", range(1, 17))
+def test_axes_are_those_that_the_file_names(tmp_path, value):
+    g = random_gaussians(20, degree=2, seed=value)
+    content = encode_spz(g, version=4, frame="rdf")
+    record = struct.pack("<II", 0xADBE0003, 4)
+    assert content.count(record + struct.pack("<I", 6)) == 1
+    (tmp_path / "a.spz").write_bytes(
+        content.replace(record + struct.pack("<I", 6), record + struct.pack("<I", value))
+    )
+    splat = read_spz_splat(tmp_path / "a.spz")
+    stored, read = decode_spz(content, frame="rdf"), splat.gaussians
+    assert bool(splat.notes) == (value in (9, 10, 15, 16))  # where SPZ's library has another sign
+    ours = {"r": [1, 0, 0], "l": [-1, 0, 0], "d": [0, 1, 0], "u": [0, -1, 0], "f": [0, 0, 1], "b": [0, 0, -1]}
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array([ours[axis] for axis in AXES[value - 1]]).T
+    np.testing.assert_allclose(read.means, stored.means.numpy() @ matrix[:3, :3].T, atol=1e-6)
+    expected = placed(stored, matrix)
+    torch.testing.assert_close(shapes(read), shapes(expected), atol=1e-5, rtol=1e-4)
+    direction = np.array([0.3, 0.8, -((1 - 0.73) ** 0.5)])
+    np.testing.assert_allclose(seen(read, matrix[:3, :3] @ direction), seen(stored, direction), atol=1e-5)
+
+
+def shapes(g: Gaussians) -> torch.Tensor:
+    axes = rotation_matrices(g.quats.double()) * g.log_scales.double().exp()[:, None]
+    return axes @ axes.mT
+
+
+def test_degree_4_is_cut_to_3(tmp_path):
+    g = random_gaussians(9, degree=3, seed=4)
+    raw = zlib.decompress(encode_spz(g), 31)
+    at = 16 + 9 * 20
+    wide = np.full((9, 24, 3), 7, np.uint8)
+    wide[:, :15] = np.frombuffer(raw, np.uint8, 9 * 45, at).reshape(9, 15, 3)
+    (tmp_path / "a.spz").write_bytes(pack(raw[:12] + b"\4" + raw[13:at] + wide.tobytes()))
+    splat = read_spz_splat(tmp_path / "a.spz")
+    assert torch.equal(splat.gaussians.shN, decode_spz(encode_spz(g)).shN)
+    assert splat.notes == ("harmonics of degree 4 are left out; degrees 0 to 3 are kept",)
+
+
+def test_version_1_has_half_floats():
+    means = np.array([[1.5, -2.25, 1000], [0, 0.125, -3]], "<f2")
+    body = (
+        means.tobytes() + bytes([127, 128]) + bytes([127] * 6) + bytes([160] * 6) + bytes([255, 128, 128] * 2)
+    )
+    g = decode_spz(pack(header(2, version=1) + body), frame="rdf")
+    assert g.means.tolist() == means.astype(float).tolist()
+    np.testing.assert_allclose(g.quats[0], [0, 1, 1 / 255, 1 / 255], atol=1e-2)
+    assert g.log_scales.tolist() == [[0.0] * 3] * 2
+
+
+def test_extensions_of_version_3(tmp_path):
+    g = random_gaussians(9, degree=1, seed=5)
+    raw = zlib.decompress(encode_spz(g, frame="rdf"), 31)
+    more = struct.pack("<III", 0x12340001, 4, 0) + struct.pack("<III", 0xADBE0003, 4, 6)
+    (tmp_path / "a.spz").write_bytes(pack(raw[:14] + b"\2" + raw[15:] + more))
+    assert torch.equal(
+        read_spz_splat(tmp_path / "a.spz").gaussians.means, decode_spz(pack(raw), frame="rdf").means
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

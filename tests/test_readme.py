@@ -125,7 +125,10 @@ def test_everything_as_typed(tmp_path: Path) -> None:
             assert_it_serves(words_of(line), checkout, env)
             continue
         if words_of(line)[1] == "adopt":
-            shutil.copy(checkout / "runs/demo/nested/composed.ply", checkout / "scene.ply")
+            for suffix in ("", ".labels.json"):
+                shutil.copy(
+                    checkout / f"runs/demo/nested/composed.ply{suffix}", checkout / f"scene.ply{suffix}"
+                )
         done = run(line)
         if done.returncode and words_of(line)[:3] == ["sagesplat", "run", "photos"]:
             assert "hf download" in done.stderr, done.stderr  # without a network: what to do is said

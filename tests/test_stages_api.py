@@ -14,6 +14,7 @@ from sagesplat import (
 )
 from sagesplat.adapt.plan_files import read_plans
 from sagesplat.core.errors import RunError
+from sagesplat.formats.labels import sidecar
 from sagesplat.formats.splats import read_splat
 from sagesplat.stages.export import export_increments, export_scene
 
@@ -34,6 +35,16 @@ def test_a_composed_scene_is_for_viewers_that_do_not_antialias(runs, tmp_path):
         path = tmp_path / f"{mode}.ply"
         export_scene(run.job, path, level=1, labels=(), target=None, rasterize_mode=mode)
         assert read_splat(path).antialiased is (mode == "antialiased")
+    for name in ("a.glb", "a.compressed.ply", "a.splat", "inside.ply"):
+        inside = name == "inside.ply"
+        export_scene(run.job, tmp_path / name, level=1, labels=(), target=None, labels_inside=inside)
+        splat = read_splat(tmp_path / name)
+        assert splat.gaussians.counts() == read_splat(tmp_path / "classic.ply").gaussians.counts()
+        assert splat.names == read_splat(tmp_path / "classic.ply").names
+        assert not splat.antialiased
+        assert sidecar(tmp_path / name).exists() != (name in ("a.glb", "inside.ply"))
+    with pytest.raises(RunError, match=r"--labels-inside is for \.ply"):
+        export_scene(run.job, tmp_path / "b.spz", level=1, labels=(), target=None, labels_inside=True)
     export_increments(run.job, tmp_path / "chunks", "ply")
     assert not any(read_splat(path).antialiased for path in (tmp_path / "chunks").glob("*.ply"))
     levels = tmp_path / "lod-meta.json"

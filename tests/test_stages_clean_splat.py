@@ -14,6 +14,7 @@ from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import SageError
 from sagesplat.core.events import Event, StageDone
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.formats.labels import sidecar
 from sagesplat.formats.ply import read_ply, select_ply, write_ply
 from sagesplat.formats.splats import read_splat
 from sagesplat.io.ply_header import read_header
@@ -51,6 +52,9 @@ def test_hidden_gaussians_go_and_a_picture_shows_it(folder: Path, tmp_path: Path
     assert lines[0].startswith(f"{N + 3 - len(left)} of {N + 3} Gaussians removed: ")
     assert lines[-1] == f"6 photos of {folder / 'capture'}"
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    there = dict(zip(map(tuple, before.means.tolist()), before.label_ids.tolist(), strict=True))
+    assert [there[row] for row in map(tuple, left.means.tolist())] == left.label_ids.tolist()
+    assert sidecar(tmp_path / "out.ply").exists()
 
 
 def test_rows_of_a_ply_keep_properties_that_nobody_knows(folder: Path, tmp_path: Path) -> None:

@@ -463,15 +463,15 @@ def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -
 def test_export_writes_what_other_viewers_read(finished: Path, tmp_path: Path) -> None:
     job, options = quiet(finished), {"level": 3, "labels": [], "target": None}
     expected = job.ladder.load(3)
-    for name in ("a.ply", "a.spz", "a.sog"):
+    for name in ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat"):
         assert export_scene(job, tmp_path / name, **options) == len(expected)
         splat = read_splat(tmp_path / name)
         assert splat.gaussians.counts() == expected.counts()
         assert splat.names.items() <= job.names().items()
     with pytest.raises(RunError, match=r"a\.sog: exists; add --force"):
         export_scene(job, tmp_path / "a.sog", **options)
-    with pytest.raises(DataError, match=r"a\.glb: its name says no format"):
-        export_scene(job, tmp_path / "a.glb", **options)
+    with pytest.raises(DataError, match=r"a\.ksplat: its name says no format"):
+        export_scene(job, tmp_path / "a.ksplat", **options)
     with pytest.raises(RunError, match="levels are for lod-meta"):
         export_scene(job, tmp_path / "b.ply", **options, levels=[1])
 

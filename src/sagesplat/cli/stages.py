@@ -41,7 +41,9 @@ from sagesplat.core.config import (
 from sagesplat.core.errors import RunError
 
 _Courtyards = Annotated[int, Meta(ge=1, le=100)]
-_SPLAT = "splat: PLY, compressed PLY, SPZ, SOG, streamed SOG (lod-meta.json), glTF or .splat"
+_SPLAT = (
+    "splat: PLY, compressed PLY, SPZ, SOG, streamed SOG (lod-meta.json, .ssog), glTF, .splat, or a ZIP of one"
+)
 _INSTANCES = (
     'categories, such as "chair,car"; things: all that can be counted; *: all; "": fold instances back'
 )
@@ -222,7 +224,7 @@ def clean(
 
     Args:
         run: run folder; or a splat, of which OUT gets what stays
-        out: .ply, .spz or .sog to write; only with a splat
+        out: .ply, .compressed.ply, .spz, .sog, .glb or .splat to write; only with a splat
         cameras: of a splat: where its photos were taken from, as a capture (best with its photos), a
             cameras.json of 3DGS, a transforms.json or a viewpoints.json (default: viewpoints drawn from the
             splat, which tell less)

@@ -27,13 +27,15 @@ def export(
     chunks: Literal["spz", "ply"] | None = None,
     levels: tuple[StepNumber, ...] = (),
     rasterize_mode: Literal["classic", "antialiased"] | None = None,
+    labels_inside: bool = False,
     ladder: Ladder = "nested",
     machine: Annotated[Compute, Flat] = Compute(),
 ) -> None:
     """Write Gaussians for other viewers: the planned scene, one level, all levels, or their increments.
 
-    The name of OUT chooses the format: .ply, .spz, .sog, or FOLDER/lod-meta.json, which holds all levels.
-    Categories are kept: as a property of a PLY, a record of an SPZ, in a file beside a SOG.
+    The name of OUT chooses the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, or
+    FOLDER/lod-meta.json, which holds all levels. Categories are kept: in a file beside (OUT.labels.json), or
+    inside an .spz and a .glb.
 
     Args:
         run: run folder
@@ -46,8 +48,10 @@ def export(
             target)
         target_ssim: write the scene planned for this SSIM against photos
         levels: numbers of the levels that lod-meta.json gets (default: all)
-        rasterize_mode: how viewers of the file draw (default: classic for .ply, as most do and no header
-            tells them; .spz, .sog and lod-meta.json say how the run was trained)
+        rasterize_mode: how viewers of the file draw (default: as the run was trained for .spz, .sog and
+            lod-meta.json, which say it; else classic, as most do)
+        labels_inside: write the categories into the .ply, as a property and comments; viewers that rely on
+            the published layout then fail
         chunks: write the increment of each level of each category as a file of this format
     """
     from sagesplat.segment.edit import parse_names
@@ -55,8 +59,9 @@ def export(
 
     if chunks and (only or without):
         raise RunError(f"{out}: --only and --without are for one scene; leave them out with --chunks")
-    if chunks and rasterize_mode:
-        raise RunError(f"{out}: --rasterize-mode is for one scene; leave it out with --chunks")
+    if chunks and (rasterize_mode or labels_inside):
+        given = "--rasterize-mode" if rasterize_mode else "--labels-inside"
+        raise RunError(f"{out}: {given} is for one scene; leave it out with --chunks")
     if target_fidelity is not None and target_ssim is not None:
         raise RunError(f"{out}: a scene has one target; leave out --target-ssim or --target-fidelity")
     with open_job(run, machine, ladder) as job:
@@ -68,6 +73,7 @@ def export(
             count = export_scene(
                 job, out, level=level, labels=parse_names(only, "only"), target=target, levels=levels,
                 rasterize_mode=rasterize_mode, without=parse_names(without, "without"),
+                labels_inside=labels_inside,
             )  # fmt: skip
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 

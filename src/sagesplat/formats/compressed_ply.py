@@ -12,6 +12,7 @@ which packs into four 32-bit words, from the highest bits on:
 Element `sh`, if it is there, has f_rest_0.. as bytes: value / 8 + 0.5.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,9 +22,12 @@ import torch
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import BASES, C0
+from sagesplat.formats.labels import write_or_remove_labels
 from sagesplat.formats.ply import is_antialiased
-from sagesplat.formats.quantisation import largest_restored, logits_of_bytes
-from sagesplat.formats.splat import Splat, SplatReader
+from sagesplat.formats.quantisation import OTHERS, largest_restored, logits_of_bytes
+from sagesplat.formats.sog_write import sog_order
+from sagesplat.formats.splat import Splat, SplatReader, SplatWriter, check_writable
+from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import Element, read_elements
 
 _CHUNK = 256  # Gaussians
@@ -145,6 +149,89 @@ def _rotations(words: np.ndarray) -> np.ndarray:
     return largest_restored(words >> 30, others)
 
 
+def write_compressed_ply(
+    path: Path,
+    g: Gaussians,
+    names: Mapping[int, str] | None = None,
+    *,
+    parents: Mapping[int, str] | None = None,
+    antialiased: bool = False,
+) -> None:
+    """Write a compressed PLY atomically, rows by category and in Morton order; labels go beside it.
+
+    Positions, log scales and colours are rounded between those of 256 neighbours, as the layout above says;
+    log scales are clipped to [-20, 20], harmonics to [-4, 4]. Arguments as those of `write_ply`.
+
+    Raises:
+        DataError: For NaN or Inf, or a quaternion of zeros.
+    """
+    g = g.detach().to("cpu")
+    check_writable(g, str(path))
+    g = g.select(torch.from_numpy(sog_order(g)))
+    count, bases = len(g), g.shN.shape[1]
+    chunk, vertex = _packed(g)
+    elements = [("chunk", chunk), ("vertex", vertex)]
+    if bases:
+        rest = g.shN.transpose(1, 2).reshape(count, 3 * bases).double().numpy()
+        sh: np.ndarray = np.empty(count, [(f"f_rest_{i}", "u1") for i in range(3 * bases)])
+        for i, name in enumerate(sh.dtype.names or ()):
+            sh[name] = np.floor((rest[:, i] / 8 + 0.5) * 256).clip(0, 255)
+        elements.append(("sh", sh))
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += ["comment SplatRenderMode: mip"] if antialiased else []
+    kinds = {"f4": "float", "u4": "uint", "u1": "uchar"}
+    for name, rows in elements:
+        lines.append(f"element {name} {len(rows)}")
+        lines += [f"property {kinds[rows.dtype[key].str[1:]]} {key}" for key in rows.dtype.names or ()]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode())
+        for _, rows in elements:
+            rows.tofile(file)
+        write_or_remove_labels(path, g.label_ids, names or {}, parents or {})
+
+
+def _packed(g: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of the elements chunk and vertex."""
+    count = len(g)
+    chunks = -(-count // _CHUNK)
+    rgb = (g.sh0[:, 0].double() * C0 + 0.5).numpy()
+    scales = g.log_scales.double().clamp(-20, 20).numpy()
+    ranges: dict[str, np.ndarray] = {}
+    shares = []
+    for kind, axes, values in (
+        ("", "xyz", g.means.double().numpy()),
+        ("scale_", "xyz", scales),
+        ("", "rgb", rgb),
+    ):
+        starts = np.arange(0, count, _CHUNK)
+        low, high = (reduce.reduceat(values, starts).astype("<f4") for reduce in (np.minimum, np.maximum))
+        ranges |= dict(zip(_ranges(kind, axes), [*low.T, *high.T], strict=True))
+        low, high = (np.repeat(ends, _CHUNK, axis=0)[:count].astype(np.float64) for ends in (low, high))
+        shares.append((values - low) / np.where(high > low, high - low, 1))
+    chunk: np.ndarray = np.empty(chunks, [(name, "<f4") for name in ranges])
+    for name, column in ranges.items():
+        chunk[name] = column
+    vertex: np.ndarray = np.empty(count, [(name, "<u4") for name in _WORDS])
+    vertex["packed_position"], vertex["packed_scale"] = (_words(share, _BITS) for share in shares[:2])
+    opacities = torch.sigmoid(g.logit_opacities.double())[:, None].numpy()
+    eights = np.array([[24, 8], [16, 8], [8, 8], [0, 8]], np.uint32)
+    vertex["packed_color"] = _words(np.concatenate([shares[2], opacities], 1), eights)
+    q = g.quats.double().numpy()
+    largest = np.abs(q).argmax(1)
+    q = q / (np.linalg.norm(q, axis=1) * np.sign(q[np.arange(count), largest]))[:, None]
+    others = np.take_along_axis(q, OTHERS[largest], axis=1) / 2**0.5 + 0.5
+    tens = np.array([[20, 10], [10, 10], [0, 10]], np.uint32)
+    vertex["packed_rotation"] = largest.astype(np.uint32) << 30 | _words(others, tens)
+    return chunk, vertex
+
+
+def _words(shares: np.ndarray, fields: np.ndarray) -> np.ndarray:
+    """Words, uint32 [N], of numbers in [0, 1], [N, K], in fields of a shift and a width, [K, 2]."""
+    most = (1 << fields[:, 1].astype(np.int64)) - 1
+    values = np.rint(shares * most).clip(0, most).astype(np.uint32)
+    return (values << fields[:, 0]).sum(1, dtype=np.uint32)
+
+
 def _harmonics(values: np.ndarray) -> np.ndarray:
     share = np.where(values == 0, 0.0, np.where(values == 255, 1.0, (values + 0.5) / 256))
     return (share - 0.5) * 8
@@ -152,4 +239,10 @@ def _harmonics(values: np.ndarray) -> np.ndarray:
 
 READER = SplatReader(
     lambda path, _: read_compressed_ply(path), magic=(b"ply\n", b"ply\r"), accepts=_is_compressed
+)
+WRITER = SplatWriter(
+    lambda path, g, names, parents, antialiased: write_compressed_ply(
+        path, g, names, parents=parents, antialiased=antialiased
+    ),
+    antialiases=False,
 )

@@ -6,6 +6,7 @@
 4    rotation w x y z, times 128, plus 128
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,11 @@ import torch
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.sh import C0
+from sagesplat.core.sh import C0, sh0_to_rgb
+from sagesplat.formats.labels import write_or_remove_labels
 from sagesplat.formats.quantisation import logits_of_bytes
-from sagesplat.formats.splat import Splat, SplatReader
+from sagesplat.formats.splat import Splat, SplatReader, SplatWriter, check_writable
+from sagesplat.io.files import atomic_path
 
 _ROW = np.dtype(
     [("means", "<f4", 3), ("scales", "<f4", 3), ("rgb", "u1", 3), ("alpha", "u1"), ("quat", "u1", 4)]
@@ -51,4 +54,33 @@ def read_dotsplat(path: Path) -> Splat:
     return Splat(g, ".splat")
 
 
+def write_dotsplat(
+    path: Path,
+    g: Gaussians,
+    names: Mapping[int, str] | None = None,
+    *,
+    parents: Mapping[int, str] | None = None,
+) -> None:
+    """Write a .splat file atomically, rows as they are, without harmonics; labels go beside it.
+
+    Colours and opacities are rounded to 1/255, components of rotations to 1/128. DataError for NaN or Inf, or
+    a quaternion of zeros.
+    """
+    g = g.detach().to("cpu")
+    check_writable(g, str(path))
+    table: np.ndarray = np.empty(len(g), _ROW)
+    table["means"], table["scales"] = g.means.numpy(), g.log_scales.exp().numpy()
+    table["rgb"] = (sh0_to_rgb(g.sh0[:, 0]).clamp(0, 1) * 255).round().numpy()
+    table["alpha"] = (torch.sigmoid(g.logit_opacities) * 255).round().numpy()
+    table["quat"] = (torch.nn.functional.normalize(g.quats) * 128 + 128).round().clamp(0, 255).numpy()
+    with atomic_path(path) as temporary:
+        table.tofile(temporary)
+        write_or_remove_labels(path, g.label_ids, names or {}, parents or {})
+
+
 READER = SplatReader(lambda path, _: read_dotsplat(path), suffix=".splat")
+WRITER = SplatWriter(
+    lambda path, g, names, parents, _: write_dotsplat(path, g, names, parents=parents),
+    antialiases=False,
+    sh_degree=0,
+)

@@ -1,8 +1,11 @@
 """glTF with splats (KHR_gaussian_splatting, ratified by Khronos): .glb, and .gltf with its buffers.
 
 Attributes of a primitive of points: POSITION, and with the extension's name before a colon ROTATION (xyzw),
-SCALE (standard deviations), OPACITY (0 to 1), SH_DEGREE_L_COEF_M. Axes are left, up, front. An SPZ inside
-(KHR_gaussian_splatting_compression_spz_2, a draft) is read, too: its bytes are those of an .spz.
+SCALE (standard deviations), OPACITY (0 to 1), SH_DEGREE_L_COEF_M. Axes are left, up, front. What drafts had
+is read, too: logarithms of scales, COLOR_0, _ROTATION and _SCALE, and an SPZ inside.
+
+Categories are ids of features (`_FEATURE_ID_0`, EXT_mesh_features): label ids, 65535 for none; their names
+are in the primitive's `extras`.
 """
 
 import base64
@@ -10,8 +13,8 @@ import binascii
 import json
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
 
@@ -20,18 +23,34 @@ import torch
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.core.transform import transformed
+from sagesplat.core.sh import C0
+from sagesplat.core.transform import placed, transformed
+from sagesplat.formats.labels import labelled
 from sagesplat.formats.splat import Splat, SplatReader
 from sagesplat.formats.spz import decode_spz
 from sagesplat.io.files import loads_json, regular
 
-_NAME = "KHR_gaussian_splatting"
-_SPZ = (f"{_NAME}_compression_spz_2", f"{_NAME}_compression_spz")
+NAME = "KHR_gaussian_splatting"
+_SPZ = (
+    f"{NAME}_compression_spz_2",
+    f"{NAME}_compression_spz",
+    "KHR_spz_gaussian_splats_compression",  # drafts, in place of NAME
+    "KHR_spz_compression",
+)
+_SUPPORTED = {NAME, *_SPZ, "KHR_mesh_quantization", "EXT_mesh_features", "EXT_structural_metadata"}
+_NO_MATTER = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")  # for splats
+COLOURS = "srgb_rec709_display"
+_COLOURS = (COLOURS, "BT.709", "BT.709-sRGB")  # the latter are of drafts
+_DRAFTS = {"ROTATION": "_ROTATION", "SCALE": "_SCALE"}
 _CURE = "export it again"
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _NODES = 10_000
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # about z: from left, up, front to right, down, front
+_MOST_LOG = 50.0  # of a scale: e^50 is none
+EXTRAS, ANTIALIASED = "sagesplat-labels", "sagesplat-antialiased"
+FEATURES = "_FEATURE_ID_0"
+UNLABELLED = 65535  # feature id
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])  # about z: from left, up, front to right, down, front
 
 
 @dataclass(frozen=True)
@@ -39,25 +58,37 @@ class _Asset:
     """A glTF document and its buffers."""
 
     json: dict[str, Any]
-    buffers: list[bytes]
+    buffers: list[bytes | None]  # None: a buffer without content, which compressed views fall back to
+    notes: dict[str, None] = field(default_factory=dict)  # as in Splat
+    names: dict[int, str] = field(default_factory=dict)
+    parents: dict[int, str] = field(default_factory=dict)
+    antialiased: list[bool] = field(default_factory=list)  # of primitives that say it
 
     def view(self, index: int) -> tuple[bytes, int, int, int]:
         """Buffer, first byte, size and stride (0: none) of a buffer view; ValueError if it is none."""
         view = _entry(self.json["bufferViews"], index)
         content = _entry(self.buffers, view["buffer"])
+        if content is None:
+            how = " and ".join(map(short, view.get("extensions", {}))) or "it has no uri"
+            raise ValueError(f"buffer {view['buffer']} has no content: {how}")
         start, size, stride = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 0)
         if not all(type(n) is int and n >= 0 for n in (start, size, stride)) or start + size > len(content):
             raise ValueError(f"bytes {start!r:.20} + {size!r:.20} of {len(content)}")
         return content, start, size, stride
 
-    def accessor(self, index: int, kind: str) -> np.ndarray:
-        """An accessor's values, float32 [N, width]; ValueError if they are not there, or of another kind."""
+    def accessor(self, index: int, *kinds: str, unit: bool = False) -> np.ndarray:
+        """An accessor's values, float32 [N, width]; ValueError if they are not there, or of other kinds.
+
+        `unit`: integers stand for numbers up to 1, whether the accessor says so or not.
+        """
         accessor = _entry(self.json["accessors"], index)
-        count, offset = accessor["count"], accessor.get("byteOffset", 0)
-        if "sparse" in accessor or accessor["type"] != kind:
-            raise ValueError(f"{accessor['type']!r:.20} in place of {kind}, or a sparse accessor")
+        count, offset, kind = accessor["count"], accessor.get("byteOffset", 0), accessor["type"]
+        if "sparse" in accessor or kind not in kinds:
+            raise ValueError(f"{kind!r:.20} in place of {' or '.join(kinds)}, or a sparse accessor")
         if not all(type(n) is int and n >= 0 for n in (count, offset)):
             raise ValueError(f"{count!r:.20} values")
+        if "bufferView" not in accessor:
+            raise ValueError("an accessor without a buffer view: compressed by an extension?")
         dtype, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[kind]
         content, start, size, stride = self.view(accessor["bufferView"])
         row = width * dtype.itemsize
@@ -66,7 +97,7 @@ class _Asset:
             raise ValueError(f"{count} values, more than fit")
         steps = (stride, dtype.itemsize)
         values = np.ndarray((count, width), dtype, content, start + offset if count else 0, steps)
-        if dtype.kind == "f" or not accessor.get("normalized", False):
+        if dtype.kind == "f" or not (unit or accessor.get("normalized", False)):
             return values.astype(np.float32)
         return (values / np.float32(np.iinfo(dtype).max)).clip(-1, 1)  # type: ignore
 
@@ -74,20 +105,26 @@ class _Asset:
 def read_gltf(path: Path) -> Splat:
     """Read the splats of a .glb or .gltf, where its nodes put them.
 
-    DataError for a file without any, one that is damaged, or what it holds is not supported: linear colours,
-    other kernels, a mesh in several nodes, and nodes that scale axes differently.
+    DataError for a file without any, one that is damaged, or one that requires or holds what is not
+    supported: other extensions, linear colours, other kernels.
     """
     try:
         asset = _asset(path)
-        parts, left = [], sum({id(buffer): len(buffer) for buffer in asset.buffers}.values())
+        required = asset.json.get("extensionsRequired", [])
+        unknown = [name for name in required if name not in _SUPPORTED and not name.startswith(_NO_MATTER)]
+        if unknown:
+            raise DataError(
+                f"{path}: requires {', '.join(map(short, unknown[:5]))}, not supported; export it without"
+            )
+        parts, left = [], sum({id(buffer): len(buffer) for buffer in asset.buffers if buffer}.values())
         for mesh, matrix in _meshes(asset.json):
             for nbytes, part in _primitives(asset, mesh):
                 left -= nbytes
                 if left < 0:  # or a few bytes could be those of many splats
-                    raise ValueError("primitives that share their positions")
-                parts.append(transformed(part, *_rigid(_turned(matrix))))
+                    raise ValueError("primitives or instances that share their positions too often")
+                parts.append(placed(part, _turned(matrix)))
         if not parts:
-            raise ValueError(f"no primitives with {_NAME}")
+            raise ValueError(f"no primitives with {NAME}")
     except DataError:
         raise
     except OSError as error:
@@ -95,8 +132,10 @@ def read_gltf(path: Path) -> Splat:
         raise DataError(f"{path}: {name} cannot be read ({error.strerror}); {_CURE}") from None
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, struct.error) as error:
         text = short(error) if isinstance(error, ValueError) else short(repr(error))
-        raise DataError(f"{path}: not a glTF with splats ({text}); {_CURE}") from None
-    return Splat(parts[0] if len(parts) == 1 else concat(parts), "glTF")
+        raise DataError(f"{path}: not a glTF with splats that is read ({text}); {_CURE}") from None
+    g = parts[0] if len(parts) == 1 else concat(parts)
+    antialiased = any(asset.antialiased)
+    return Splat(g, "glTF", asset.names, antialiased, parents=asset.parents, notes=tuple(asset.notes))
 
 
 def _entry(entries: list[Any], index: Any) -> Any:
@@ -106,14 +145,24 @@ def _entry(entries: list[Any], index: Any) -> Any:
 
 
 def _asset(path: Path) -> _Asset:
-    content, binary = regular(path).read_bytes(), b""
+    content, binary = regular(path).read_bytes(), None
     if content.startswith(b"glTF"):
-        chunks = dict(_chunks(content))
+        chunks = dict(reversed(list(_chunks(content))))  # the first of each kind
         content, binary = chunks[b"JSON"], chunks.get(b"BIN\0", b"")
     document = loads_json(content)
-    uris = [buffer.get("uri") for buffer in document.get("buffers", [])]
-    found = {uri: binary if uri is None else _buffer(path, uri) for uri in uris}
-    return _Asset(document, [found[uri] for uri in uris])
+    buffers, found = document.get("buffers", []), dict[str, bytes]()
+    for buffer in buffers:
+        if isinstance(uri := buffer.get("uri"), str) and uri not in found:
+            found[uri] = _buffer(path, uri)
+    contents = [found.get(buffer.get("uri")) for buffer in buffers]
+    if buffers and "uri" not in buffers[0] and not _falls_back(buffers[0]):
+        contents[0] = binary  # the chunk is of the first buffer alone
+    return _Asset(document, contents)
+
+
+def _falls_back(buffer: dict[str, Any]) -> bool:
+    """Whether a buffer stands for what a compression extension unpacks."""
+    return any(ext.get("fallback") is True for ext in buffer.get("extensions", {}).values())
 
 
 def _chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -137,9 +186,11 @@ def _buffer(path: Path, uri: str) -> bytes:
         except binascii.Error as error:
             raise ValueError(f"a data URI: {error}") from None
     name = unquote(uri)
-    if set(name) & set("/\\:\0") or (path.parent / name).is_symlink():
+    parts, file = PurePosixPath(name).parts, path.parent / name
+    outside = not parts or ".." in parts or bool(set(name) & set("\\:\0")) or name.startswith("/")
+    if outside or not file.resolve().is_relative_to(path.parent.resolve()) or file.is_symlink():
         raise ValueError(f"{short(name)} is not in its folder")
-    return regular(path.parent / name).read_bytes()
+    return regular(file).read_bytes()
 
 
 def _meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
@@ -151,7 +202,7 @@ def _meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarr
         roots = _entry(scenes, document.get("scene", 0)).get("nodes", [])
     if len(nodes) > _NODES:
         raise ValueError(f"{len(nodes)} nodes")
-    waiting, seen, used = [(root, np.eye(4)) for root in roots], set(), set()
+    waiting, seen = [(root, np.eye(4)) for root in roots], set()
     while waiting:
         index, above = waiting.pop()
         node = _entry(nodes, index)
@@ -160,11 +211,9 @@ def _meshes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarr
         seen.add(index)
         matrix = above @ _matrix(node)
         if "mesh" in node:
-            mesh = _entry(meshes, node["mesh"])
-            if node["mesh"] in used:
-                raise ValueError("a mesh in several nodes is not supported")
-            used.add(node["mesh"])
-            yield mesh, matrix
+            if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
+                raise ValueError("EXT_mesh_gpu_instancing of a node is not supported")
+            yield _entry(meshes, node["mesh"]), matrix
         waiting += [(child, matrix) for child in node.get("children", [])]
 
 
@@ -192,69 +241,119 @@ def _numbers(values: list[Any], count: int) -> np.ndarray:
 
 def _turned(matrix: np.ndarray) -> np.ndarray:
     """A node's matrix, from its own axes to COLMAP's."""
-    return np.block([[_HALF_TURN @ matrix[:3]], [np.eye(4)[3:]]])
-
-
-def _rigid(matrix: np.ndarray) -> tuple[np.ndarray, float, np.ndarray | None]:
-    """Rotation, scale and translation; ValueError for a matrix that is not made of these."""
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    rotation = matrix[:3, :3] / scale if scale > 1e-12 else np.zeros((3, 3))
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        raise ValueError("a node mirrors or scales its axes differently; apply its transform")
-    u, _, vt = np.linalg.svd(rotation)
-    near = np.rint(u @ vt)  # turns by quarters stay exact
-    exact = np.where(np.abs(u @ vt - near) < 1e-9, near, u @ vt)
-    return exact, scale, matrix[:3, 3] if matrix[:3, 3].any() else None
+    return np.block([[HALF_TURN @ matrix[:3]], [np.eye(4)[3:]]])
 
 
 def _primitives(asset: _Asset, mesh: dict[str, Any]) -> Iterator[tuple[int, Gaussians]]:
     """The splats of a mesh in its own axes, and how many bytes no others should have."""
     for primitive in mesh["primitives"]:
-        splats = primitive.get("extensions", {}).get(_NAME)
+        given = primitive.get("extensions", {})
+        splats = given.get(NAME, {} if given.keys() & set(_SPZ) else None)
         if splats is None:
             continue
-        if splats.get("kernel", "ellipse") != "ellipse" or str(splats.get("colorSpace", "")).startswith(
-            "lin"
-        ):
-            raise ValueError(f"splats of kernel or colours {json.dumps(splats):.100} are not supported")
-        inside = [splats.get("extensions", {}).get(name) for name in _SPZ]
-        packed = next((view for view in inside if view is not None), None)
+        _check(asset, splats)
+        inside = splats.get("extensions", {}) | given
+        packed = next((inside[name] for name in _SPZ if name in inside), None)
         if packed is not None:
             content, start, size, _ = asset.view(packed["bufferView"])
-            yield size, transformed(decode_spz(content[start : start + size], name="SPZ in it"), _HALF_TURN)
+            yield size, transformed(decode_spz(content[start : start + size], name="SPZ in it"), HALF_TURN)
         else:
             g = _attributes(asset, primitive["attributes"])
-            yield 12 * len(g), g
+            yield 12 * len(g), _named(asset, primitive, g)
+
+
+def _check(asset: _Asset, splats: dict[str, Any]) -> None:
+    """ValueError for a kernel or colours that would be drawn wrongly; a note for hints that are not known."""
+    if (kernel := splats.get("kernel", "ellipse")) != "ellipse":
+        raise ValueError(f"splats of kernel {kernel!r:.60} are not supported")
+    if (colours := splats.get("colorSpace", COLOURS)) not in _COLOURS:
+        raise ValueError(f"splats of colours {colours!r:.60} are not supported, {COLOURS} is")
+    for name in splats.get("extensions", {}).keys() - set(_SPZ):
+        asset.notes[f"extension {short(name)} of the splats is not known, and not read"] = None
+    for key, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
+        if (hint := splats.get(key, usual)) != usual:
+            asset.notes[f"{key} {short(repr(hint))} is not known; it is drawn as {usual}"] = None
 
 
 def _attributes(asset: _Asset, attributes: dict[str, int]) -> Gaussians:
-    def values(name: str, kind: str = "VEC3") -> np.ndarray:
-        if name not in attributes:
-            raise ValueError(f"no attribute {name}")
-        found = asset.accessor(attributes[name], kind)
+    def values(name: str, *kinds: str, unit: bool = False) -> np.ndarray:
+        draft = _DRAFTS.get(name, "")
+        key = draft if draft in attributes and f"{NAME}:{name}" not in attributes else f"{NAME}:{name}"
+        key = name if name == "COLOR_0" else key
+        if key not in attributes:
+            raise ValueError(f"no attribute {key}")
+        found = asset.accessor(attributes[key], *kinds, unit=unit)
         if len(found) != len(means):
-            raise ValueError(f"{len(found)} values of {name} for {len(means)} positions")
+            raise ValueError(f"{len(found)} values of {key} for {len(means)} positions")
         return found
 
     means = asset.accessor(attributes["POSITION"], "VEC3")
-    degrees = [d for d in (1, 2, 3) if f"{_NAME}:SH_DEGREE_{d}_COEF_0" in attributes]
+    degrees = [d for d in (1, 2, 3) if f"{NAME}:SH_DEGREE_{d}_COEF_0" in attributes]
     if degrees != [1, 2, 3][: len(degrees)]:
         raise ValueError(f"harmonics of degrees {degrees}")
-    coefficients = [f"{_NAME}:SH_DEGREE_{d}_COEF_{i}" for d in degrees for i in range(2 * d + 1)]
+    coefficients = [f"SH_DEGREE_{d}_COEF_{i}" for d in degrees for i in range(2 * d + 1)]
     shN = np.empty((len(means), len(coefficients), 3), np.float32)
     for i, name in enumerate(coefficients):
-        shN[:, i] = values(name)
-    opacities = values(f"{_NAME}:OPACITY", "SCALAR")[:, 0]
-    with np.errstate(all="ignore"):  # zeros and what is out of range: such Gaussians are dropped
-        log_scales = np.log(values(f"{_NAME}:SCALE"))
-        logits = np.log(opacities) - np.log1p(-opacities)
-    quats = np.roll(values(f"{_NAME}:ROTATION", "VEC4"), 1, axis=1)
-    sh0 = values(f"{_NAME}:SH_DEGREE_0_COEF_0")[:, None]
-    arrays = {"means": means, "quats": quats, "log_scales": log_scales, "sh0": sh0, "shN": shN}
-    tensors = {
-        name: torch.from_numpy(array) for name, array in (arrays | {"logit_opacities": logits}).items()
-    }
+        shN[:, i] = values(name, "VEC3")
+    if f"{NAME}:OPACITY" not in attributes and "COLOR_0" in attributes:  # the first drafts
+        colours = values("COLOR_0", "VEC3", "VEC4", unit=True)
+        opacities = colours[:, 3] if colours.shape[1] == 4 else np.ones(len(means), np.float32)
+        sh0 = (colours[:, None, :3] - np.float32(0.5)) / np.float32(C0)
+        asset.notes[f"colours and opacities are those of COLOR_0, as drafts of {NAME} had them"] = None
+    else:
+        opacities = values("OPACITY", "SCALAR", unit=True)[:, 0]
+        sh0 = values("SH_DEGREE_0_COEF_0", "VEC3")[:, None]
+    quats = np.roll(values("ROTATION", "VEC4"), 1, axis=1)
+    arrays = {"means": means, "quats": quats, "sh0": sh0, "shN": shN}
+    arrays["log_scales"] = _log_scales(asset, values("SCALE", "VEC3"))
+    arrays["logit_opacities"] = _logits(asset, opacities)
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
     return Gaussians(**tensors, label_ids=torch.full((len(means),), -1, dtype=torch.int16))
+
+
+def _log_scales(asset: _Asset, scales: np.ndarray) -> np.ndarray:
+    """Logarithms of scales, which are standard deviations, or as drafts and early exporters had them.
+
+    Standard deviations are not negative, and of a scene's logarithms hardly all are positive.
+    """
+    if not (scales < 0).any():
+        with np.errstate(all="ignore"):  # zeros and NaN: such Gaussians are dropped
+            return np.log(scales)
+    if (largest := float(np.nanmax(scales))) > _MOST_LOG:
+        raise ValueError(f"scales from {float(np.nanmin(scales)):.3g} to {largest:.3g}")
+    asset.notes[f"scales are logarithms, as drafts of {NAME} had them"] = None
+    return scales
+
+
+def _logits(asset: _Asset, opacities: np.ndarray) -> np.ndarray:
+    """Logits of opacities, which may be logits already: then they are not between 0 and 1."""
+    if ((opacities < -0.01) | (opacities > 1.01)).any():
+        asset.notes["opacities are logits: they are not between 0 and 1"] = None
+        return opacities
+    with np.errstate(all="ignore"):  # zeros and NaN: such Gaussians are dropped
+        within = opacities.clip(0, 1)
+        return np.log(within) - np.log1p(-within)
+
+
+def _named(asset: _Asset, primitive: dict[str, Any], g: Gaussians) -> Gaussians:
+    """The Gaussians with the labels that `write_glb` wrote, if there are any."""
+    extras = primitive.get("extras")
+    if not isinstance(extras, dict):
+        return g
+    asset.antialiased.append(extras.get(ANTIALIASED) is True)
+    if EXTRAS not in extras or FEATURES not in primitive["attributes"]:
+        return g
+    ids = asset.accessor(primitive["attributes"][FEATURES], "SCALAR")[:, 0]
+    if len(ids) != len(g) or not ((ids >= 0) & (ids <= UNLABELLED) & (ids == np.floor(ids))).all():
+        raise ValueError(f"{FEATURES} of {len(ids)} values")
+    ids = np.where(ids == UNLABELLED, -1, ids)
+    if (ids > 32767).any():
+        raise ValueError(f"{FEATURES} up to {ids.max():g}")
+    g = replace(g, label_ids=torch.from_numpy(ids.astype(np.int16)))
+    splat = labelled(Splat(g, "glTF"), json.dumps(extras[EXTRAS]).encode())
+    asset.names.update(splat.names)
+    asset.parents.update(splat.parents)
+    return splat.gaussians
 
 
 READER = SplatReader(lambda path, _: read_gltf(path), magic=(b"glTF",), json_key="asset")

@@ -22,7 +22,7 @@ from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
-from sagesplat.formats.ply import read_ply, write_ply
+from sagesplat.formats.ply import put_ply, read_ply
 from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, read_spz
 from sagesplat.formats.stream import Decoded, decode_stream
 from sagesplat.io.files import atomic_folder, write_json
@@ -123,7 +123,7 @@ def write_increments(
                     encode_spz(part, sh_bits=bits, coarse=level not in fine, antialiased=antialiased)
                 )
             else:
-                write_ply(temporary, part, names, antialiased=antialiased)
+                put_ply(temporary, part, antialiased=antialiased)
             content = temporary.read_bytes()
             digest = hashlib.sha256(content).hexdigest()
             uri = f"{stems[label]}-{level:02d}-{digest[:12]}.{suffix}"

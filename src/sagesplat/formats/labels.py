@@ -71,17 +71,28 @@ def as_json(
     runs: bool = True,
 ) -> bytes:
     """The labels of rows, the names of those that occur, and the categories of the instances among them."""
+    return json.dumps(as_document(label_ids, names, parents, runs=runs), ensure_ascii=False).encode()
+
+
+def as_document(
+    label_ids: Int16[Tensor, " N"],
+    names: Mapping[int, str],
+    parents: Mapping[int, str] = NO_PARENTS,
+    *,
+    runs: bool = True,
+) -> dict[str, Any]:
+    """What `as_json` writes."""
     labels, sizes = (v.tolist() for v in torch.unique_consecutive(label_ids, return_counts=True))
     counts: dict[int, int] = {}
     for label, size in zip(labels, sizes, strict=True):
         counts[label] = counts.get(label, 0) + size
-    named = {i: repaired(names[i], f"category {i}") for i in sorted(counts) if i in names}
+    named = {i: repaired(names[i], f"category {i}") for i in sorted(counts) if i in names and i >= 0}
     document: dict[str, Any] = {"format": _FORMAT, "version": 1, "names": named, "counts": counts}
     if of := {i: repaired(parents[i], f"category of {i}") for i in named if i in parents}:
         document["parents"] = of
     if runs:
         document["runs"] = list(zip(labels, sizes, strict=True))
-    return json.dumps(document, ensure_ascii=False).encode()
+    return document
 
 
 def with_labels(splat: Splat, path: Path) -> Splat:

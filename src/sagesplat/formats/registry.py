@@ -4,6 +4,7 @@ from sagesplat.formats import (
     compressed_ply,
     dotsplat,
     gltf,
+    gltf_write,
     lod_meta,
     lod_meta_write,
     ply,
@@ -28,6 +29,9 @@ WRITERS: dict[str, SplatWriter] = {
     ".ply": ply.WRITER,
     ".spz": spz.WRITER,
     ".sog": sog_write.WRITER,
+    ".glb": gltf_write.WRITER,
+    ".compressed.ply": compressed_ply.WRITER,
+    ".splat": dotsplat.WRITER,
     lod_meta.LOD_META: lod_meta_write.WRITER,
 }
-"""By the suffix of files, or their whole name."""
+"""By the suffix of files, the longest that fits, or their whole name."""

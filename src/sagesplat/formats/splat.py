@@ -27,6 +27,7 @@ class Splat:
     announced: int = -1  # Gaussians in the file; -1: as many as there are
     dropped: dict[str, int] = field(default_factory=dict)  # reason -> Gaussians that were left out
     parents: dict[int, str] = field(default_factory=dict)  # by label id of an instance: its category's name
+    notes: tuple[str, ...] = ()  # what was not read as it is in the file, a line each, for people
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class SplatWriter:
     write: WriteScene | None = None
     write_levels: WriteLevels | None = None
     antialiases: bool = True  # whether viewers draw a file as it says that it was trained
+    sh_degree: int = 3  # the highest that the format holds
 
 
 def cleaned(splat: Splat, name: str) -> Splat:

@@ -2,11 +2,13 @@
 
 import stat
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.archive import unpacked
 from sagesplat.formats.labels import with_labels
 from sagesplat.formats.registry import READERS, WRITERS
 from sagesplat.formats.splat import Frame, ReadOptions, Splat, SplatReader, SplatWriter, WriteScene, cleaned
@@ -22,7 +24,8 @@ def read_splat(path: Path | str, lod: int = 0, *, spz_axes: Frame = "rub") -> Sp
     come from the file or from a sidecar beside it (`formats/labels.py`).
 
     Args:
-        path: The file, or the folder of a SOG (`meta.json`) or a streamed one (`lod-meta.json`).
+        path: The file, or the folder of a SOG (`meta.json`) or a streamed one (`lod-meta.json`), or a ZIP
+            archive with one splat in it, such as a .ssog.
         lod: The level of a streamed SOG; 0 is the finest, and the only one of other formats.
         spz_axes: The axes of SPZ files that do not say theirs. The format's own are right, up, back;
             PlayCanvas's tools write those of PLY, "rdf".
@@ -49,17 +52,23 @@ def read_splat(path: Path | str, lod: int = 0, *, spz_axes: Frame = "rub") -> Sp
         >>> splat.kind, len(splat.gaussians), splat.dropped, splat.names
         ('PLY', 4, {'a rotation of zeros': 1}, {0: 'tree'})
     """
-    path, kind, reader = _found(Path(path))
-    if lod and reader.num_lods is None:
-        raise DataError(f"{path}: {kind} has one level; read level 0")
-    splat = reader.read(path, ReadOptions(lod=lod, spz_axes=spz_axes))
-    return cleaned(with_labels(splat, path), str(path))
+    path = Path(path)
+    with unpacked(path) as inside:
+        file, kind, reader = _found(inside)
+        if lod and reader.num_lods is None:
+            raise DataError(f"{file}: {kind} has one level; read level 0")
+        splat = reader.read(file, ReadOptions(lod=lod, spz_axes=spz_axes))
+        splat = cleaned(with_labels(splat, file), str(file))
+        if inside != path:
+            splat = with_labels(replace(splat, kind=f"{splat.kind} in a ZIP"), path)
+    return splat
 
 
 def num_lods(path: Path) -> int:
-    """How many levels of detail a splat file or folder has: 1, but of a streamed SOG."""
-    path, _, reader = _found(path)
-    return reader.num_lods(path) if reader.num_lods else 1
+    """How many levels of detail a splat file, folder or archive has: 1, but of a streamed SOG."""
+    with unpacked(path) as inside:
+        file, _, reader = _found(inside)
+        return reader.num_lods(file) if reader.num_lods else 1
 
 
 def _found(path: Path) -> tuple[Path, str, SplatReader]:
@@ -107,8 +116,9 @@ def _recognises(reader: SplatReader, file: BinaryIO, json_keys: Collection[str])
 
 def writer_of(path: Path) -> SplatWriter:
     """How files of this name are written; DataError for a name that says no format."""
-    writer = WRITERS.get(path.name) or WRITERS.get(path.suffix.lower())
-    if writer is None:
+    suffixes = [name for name in WRITERS if name.startswith(".") and path.name.lower().endswith(name)]
+    writer = WRITERS.get(path.name) or WRITERS.get(max(suffixes, key=len, default=""))
+    if writer is None or not path.stem:
         raise DataError(f"{path}: its name says no format that is written; use {_listed(WRITERS)}")
     return writer
 

@@ -1,21 +1,22 @@
-"""SPZ, compressed Gaussians for web viewers: versions 2 (read only) to 4.
+"""SPZ, compressed Gaussians for web viewers: versions 1, 2 (read only) to 4.
 
-Niantic's format (MIT, github.com/nianticlabs/spz). Versions 2 and 3 are one gzip member, little endian: a
+Niantic's format (MIT, github.com/nianticlabs/spz). Versions 1 to 3 are one gzip member, little endian: a
 header of 16 bytes (magic, version, count as uint32; SH degree, fractional bits, flags, 0), then the
 attributes, with these bytes per Gaussian. Version 4 packs them with zstd (`spz_container.py`).
 
-    9    x y z, signed fixed point of 24 bits
+    9    x y z, signed fixed point of 24 bits. Version 1: 6 bytes, half floats
     1    opacity times 255
     3    (0.15 sh0 + 0.5) 255
     3    (log scale + 10) 16
     4    rotation, uint32: 2 bits: index of the largest of x y z w, which is positive and omitted. A sign
-         and 9 bits of each other: magnitude times 511 sqrt(2). Version 2: 3 bytes, x y z with w >= 0
-    3 K  128 + 128 times the SH coefficients, RGB last
+         and 9 bits of each other: magnitude times 511 sqrt(2). Version 1, 2: 3 bytes, x y z with w >= 0
+    3 K  128 + 128 times the SH coefficients, RGB last; of degree 4, too, which is read without its last
 
 In `coarse` files values are multiples of larger steps than the format allows: they compress better.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -26,7 +27,8 @@ from jaxtyping import Int64
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import morton_order
-from sagesplat.core.sh import bases
+from sagesplat.core.sh import BASES, bases
+from sagesplat.core.transform import transformed
 from sagesplat.formats.labels import as_json, labelled
 from sagesplat.formats.quantisation import (
     COLOUR_STEP,
@@ -59,6 +61,9 @@ _SMALLER = 511 * 2**0.5  # a quaternion's second largest component is at most sq
 _LABELS = 0x53470001  # type of our extension: `formats/labels.py`
 _AXES = 0xADBE0003  # type of Adobe's extension: its content is a row of _FRAMES
 _FRAMES: tuple[Frame, ...] = ("rub", "ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf")
+_AMBIGUOUS = (9, 10, 15, 16)  # axes that the format's library turns otherwise than their names say
+_UNSURE = "its axes are read by their names; if it is upside down, adopt it with --up y"
+_QUARTER_TURN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of axes 9 to 16, such as right, front, up
 
 
 def write_spz(
@@ -175,13 +180,13 @@ def packing_order(g: Gaussians) -> Int64[np.ndarray, " N"]:
 
 
 def read_spz(path: Path | str, label_id: int = -1, *, frame: Frame = "rub") -> Gaussians:
-    """Read an SPZ file, version 2 to 4: `decode_spz` of its content. DataError where it cannot be read."""
+    """Read an SPZ file, version 1 to 4: `decode_spz` of its content. DataError where it cannot be read."""
     path = Path(path)
     return decode_spz(_content(path), label_id, frame=frame, name=str(path))
 
 
 def decode_spz(content: bytes, label_id: int = -1, *, frame: Frame = "rub", name: str = "SPZ") -> Gaussians:
-    """Decode SPZ version 2, 3 or 4 into N Gaussians in COLMAP's axes.
+    """Decode SPZ version 1 to 4 into N Gaussians in COLMAP's axes, without harmonics of degree 4.
 
     Opacities of 0 and 255 become those a quarter of a step further inside, so that their logits are finite.
     Memory stays within what the header promises, and the promise within what `content` can hold.
@@ -208,13 +213,17 @@ def read_spz_splat(path: Path, *, frame: Frame = "rub") -> Splat:
     """
     content = _content(path)
     packed = unpacked(str(path), content)
+    turned, value = False, 0
     if (axes := packed.extensions.get(_AXES)) is not None:
         value = int.from_bytes(axes, "little")
-        if len(axes) != 4 or value >= len(_FRAMES):
+        if len(axes) != 4 or value > 16:
             raise DataError(f"{path}: axes of an unknown order ({value}); save it with axes right, up, back")
-        frame = _FRAMES[value]
-    g = _gaussians(packed, -1, frame)
-    splat = Splat(g, f"SPZ {packed.version}", antialiased=packed.antialiased)
+        turned = value > 8  # z is up or down; after a quarter turn y is
+        frame = _FRAMES[(value - 9 ^ 6) + 1 if turned else value]
+    g = _gaussians(packed, -1, frame, turned=turned)
+    notes = ["harmonics of degree 4 are left out; degrees 0 to 3 are kept"] * (packed.degree > 3)
+    notes += [_UNSURE] * (turned and value in _AMBIGUOUS)
+    splat = Splat(g, f"SPZ {packed.version}", antialiased=packed.antialiased, notes=tuple(notes))
     try:
         return labelled(splat, packed.extensions[_LABELS]) if _LABELS in packed.extensions else splat
     except ValueError as error:
@@ -228,22 +237,28 @@ def _content(path: Path) -> bytes:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give an .spz") from None
 
 
-def _gaussians(packed: Packed, label_id: int, frame: Frame) -> Gaussians:
+def _gaussians(packed: Packed, label_id: int, frame: Frame, *, turned: bool = False) -> Gaussians:
     positions, alphas, colours, scales, rotations, harmonics = packed.attributes
     count = len(positions)
-    means = (_fixed(positions) * 2.0**-packed.bits).astype(np.float32)
-    quats = _first_three(rotations) if packed.version == 2 else _unpack_rotations(rotations)
-    shN = (harmonics.reshape(count, harmonics.shape[1] // 3, 3).astype(np.float32) - 128) / 128
-    means, quats, shN = flipped(means, quats, shN, frame)
-    return Gaussians(
+    if packed.version == 1:
+        means = np.ascontiguousarray(positions).view("<f2").astype(np.float32)
+    else:
+        means = (_fixed(positions) * 2.0**-packed.bits).astype(np.float32)
+    quats = _first_three(rotations) if packed.version < 3 else _unpack_rotations(rotations)
+    shN = harmonics.reshape(count, harmonics.shape[1] // 3, 3)[:, : BASES[-1]]
+    g = Gaussians(
         means=torch.from_numpy(means),
         quats=torch.from_numpy(quats),
         log_scales=torch.from_numpy(scales / np.float32(PER_LOG_SCALE) - 10),
         logit_opacities=torch.from_numpy(logits_of_bytes(alphas[:, 0])),
         sh0=torch.from_numpy(((colours[:, None] - 127.5) / PER_COLOUR).astype(np.float32)),
-        shN=torch.from_numpy(shN),
+        shN=torch.from_numpy((shN.astype(np.float32) - 128) / 128),
         label_ids=torch.full((count,), label_id, dtype=torch.int16),
     )
+    if turned:
+        g = transformed(g, _QUARTER_TURN)
+    means, quats, shN = flipped(g.means.numpy(), g.quats.numpy(), g.shN.numpy(), frame)
+    return replace(g, means=torch.from_numpy(means), quats=torch.from_numpy(quats), shN=torch.from_numpy(shN))
 
 
 def _fractional_bits(

@@ -1,4 +1,6 @@
-"""What SPZ files wrap around the bytes of the attributes: gzip in version 2 and 3, zstd in version 4.
+"""What SPZ files wrap around the bytes of the attributes: gzip in versions 1 to 3, zstd in version 4.
+
+Versions 1 to 3 may end with extension records, as version 4 has them.
 
 Version 4, little endian: a header of 32 bytes (magic, version, count as uint32; SH degree, fractional bits,
 flags, number of streams; offset of the table, uint32; 12 zeros), extension records (type and size as uint32,
@@ -13,7 +15,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sagesplat.core.errors import DataError, short
-from sagesplat.core.sh import BASES
 
 MAX_BITS = 24  # fractional bits; readers refuse more
 MAX_COUNT = 10_000_000  # Gaussians; the reference implementation reads no more
@@ -39,7 +40,8 @@ class Packed:
     attributes: list[
         np.ndarray
     ]  # uint8 [count, width]: positions, opacities, colours, scales, rotations, shN
-    extensions: dict[int, bytes] = field(default_factory=dict)  # by type; of version 4
+    degree: int = 0  # of the harmonics, up to 4
+    extensions: dict[int, bytes] = field(default_factory=dict)  # by type
 
 
 def gzipped(count: int, degree: int, bits: int, flags: int, attributes: Sequence[np.ndarray]) -> bytes:
@@ -74,7 +76,7 @@ def zstd_packed(
 
 
 def unpacked(name: str, content: bytes) -> Packed:
-    """Unpack version 2, 3 or 4; DataError, which calls the file `name`, where it is damaged.
+    """Unpack version 1 to 4; DataError, which calls the file `name`, where it is damaged.
 
     Memory stays within what the header promises, and the promise within what `content` can hold.
     """
@@ -86,39 +88,43 @@ def _ungzipped(name: str, content: bytes) -> Packed:
     try:
         header = unpacker.decompress(content, HEADER.size)
         version, count, degree, bits, flags = _read_header(name, header)
-        if version not in (2, 3):
+        if version not in (1, 2, 3):
             raise DataError(f"{name}: SPZ version {version} is not supported; save it as version 3")
-        if flags & ~ANTIALIASED:  # extensions may change the axes, an LOD tree the meaning of opacities
-            raise DataError(
-                f"{name}: extensions or an LOD tree (flags {flags}) are not supported; save it without"
-            )
+        if flags & ~(ANTIALIASED | _EXTENSIONS):  # an LOD tree changes the meaning of opacities
+            raise DataError(f"{name}: an LOD tree (flags {flags}) is not supported; save it without")
         widths = _widths(version, degree)
         size = count * sum(widths)
         if count > MAX_COUNT or size > _EXPANDS * len(content):
             raise DataError(f"{name}: {count} Gaussians announced, more than fit; copy it again")
-        body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)  # one byte more, to detect excess data
+        more = _FREE if flags & _EXTENSIONS else 0
+        body = unpacker.decompress(unpacker.unconsumed_tail, size + more + 1)  # 1: to detect excess data
     except zlib.error as error:
-        raise DataError(f"{name}: not gzip, or damaged ({error}); give an .spz of version 2 to 4") from None
-    if len(body) != size or not unpacker.eof or unpacker.unused_data:
+        raise DataError(f"{name}: not gzip, or damaged ({error}); give an .spz of version 1 to 4") from None
+    if not size <= len(body) <= size + more or not unpacker.eof or unpacker.unused_data:
         raise DataError(f"{name}: not the {count} Gaussians announced; the file is damaged, copy it again")
-    parts = np.split(np.frombuffer(body, np.uint8), count * np.cumsum(widths[:-1]))
+    try:
+        extensions = _records(body[size:])
+    except (struct.error, ValueError) as error:
+        raise DataError(f"{name}: damaged ({short(error)}); copy it again") from None
+    parts = np.split(np.frombuffer(body, np.uint8, size), count * np.cumsum(widths[:-1]))
     attributes = [part.reshape(count, width) for part, width in zip(parts, widths, strict=True)]
-    return Packed(version, bits, bool(flags & ANTIALIASED), attributes)
+    return Packed(version, bits, bool(flags & ANTIALIASED), attributes, degree, extensions)
 
 
 def _widths(version: int, degree: int) -> tuple[int, ...]:
     """Bytes of each attribute of a Gaussian."""
-    return 9, 1, 3, 3, 3 if version == 2 else 4, 3 * BASES[degree]
+    return 6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * degree * (degree + 2)
 
 
 def _read_header(name: str, header: bytes) -> tuple[int, int, int, int, int]:
     """Version, count, SH degree, fractional bits and flags. DataError for an unsupported header."""
     if len(header) < HEADER.size or not header.startswith(MAGIC):
-        raise DataError(f"{name}: not an SPZ file; give an .spz of version 2 to 4")
+        cure = "unpack it with gunzip" if header.startswith(b"ply") else "give an .spz of version 1 to 4"
+        raise DataError(f"{name}: not an SPZ file; {cure}")
     _, version, count, degree, bits, flags, _ = HEADER.unpack(header[: HEADER.size])
-    if degree >= len(BASES) or bits > MAX_BITS:
+    if degree > 4 or bits > MAX_BITS:
         raise DataError(
-            f"{name}: SH degree {degree}, {bits} fractional bits; at most 3 and {MAX_BITS} are supported"
+            f"{name}: SH degree {degree}, {bits} fractional bits; at most 4 and {MAX_BITS} are supported"
         )
     return version, count, degree, bits, flags
 
@@ -142,7 +148,7 @@ def _unpacked_4(name: str, content: bytes) -> Packed:
     attributes = [
         np.frombuffer(part, np.uint8).reshape(count, width) for part, width in zip(parts, widths, strict=True)
     ]
-    return Packed(version, bits, bool(flags & ANTIALIASED), attributes, extensions)
+    return Packed(version, bits, bool(flags & ANTIALIASED), attributes, degree, extensions)
 
 
 def _records(content: bytes) -> dict[int, bytes]:

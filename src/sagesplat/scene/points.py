@@ -1,10 +1,8 @@
 """Initial points for training without COLMAP: read from a PLY file, or random."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
@@ -12,7 +10,7 @@ from scipy.spatial import KDTree
 
 from sagesplat.core import geometry
 from sagesplat.core.errors import SceneError, short
-from sagesplat.io.ply_header import PlyHeader, read_header
+from sagesplat.io.ply_header import read_header, read_vertices
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.scene import Points, View
 
@@ -39,7 +37,7 @@ def read_points(path: Path) -> Points:
             header = read_header(file)
             if header.count < 1 or not {"x", "y", "z"} <= header.types.keys():
                 raise ValueError("its header names no vertices or no x, y and z")
-            table = _read_vertices(path, file, header)
+            table = read_vertices(path, file, header)
     except FileNotFoundError:
         raise SceneError(
             f"{path}: no such file; add it, or remove ply_file_path to start from random points"
@@ -58,26 +56,6 @@ def read_points(path: Path) -> Points:
                 scale = FULL.get(header.types[name], 1.0)
                 rgb[:, column] = np.nan_to_num(table[name] * scale).round().clip(0, 255)
     return untracked(xyz, rgb)
-
-
-def _read_vertices(path: Path, file: BinaryIO, header: PlyHeader) -> dict[str, np.ndarray]:
-    """The vertices: property -> column [P]."""
-    types, count, row = header.types, header.count, header.dtype
-    # In text, a value takes at least a digit and a separator; the last line end may be missing.
-    smallest = row.itemsize * count if header.order else 2 * len(types) * count - 1
-    if smallest > path.stat().st_size - file.tell():
-        raise ValueError(f"{count} points announced, but the file ends before them")
-    table: np.ndarray
-    if header.order:
-        table = np.fromfile(file, row, count)
-        return {name: table[name] for name in types}
-    # With named columns numpy allocates only these, however long the first line is.
-    columns = np.dtype([(name, float) for name in types])
-    with warnings.catch_warnings(action="ignore"):  # about files without numbers; see the count
-        table = np.loadtxt(file, columns, comments=None, max_rows=count, ndmin=1, encoding="latin1")
-    if len(table) != count:
-        raise ValueError(f"{count} points of {len(types)} values announced, but there are {len(table)}")
-    return {name: table[name] for name in types}
 
 
 def random_points(views: Sequence[View], count: int = 100_000, *, cube: float | None = None) -> Points:

@@ -108,6 +108,8 @@ def _make_capture(
 
     def make() -> list[str]:
         splat = read_splat(source, config.lod, spz_axes=config.spz_axes)
+        for note in splat.notes:
+            job.emit(Warned(f"{source}: {note}"))
         for reason, count in splat.dropped.items():
             job.emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
         check_size(splat.gaussians, str(source))

@@ -15,9 +15,11 @@ from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, Warned
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.labels import sidecar, write_or_remove_labels
+from sagesplat.formats.ply import WRITER as PLY_WRITER
 from sagesplat.formats.ply import read_ply_splat, select_ply
 from sagesplat.formats.splat import Splat, undrawable
-from sagesplat.formats.splats import read_splat, scene_writer, write_splat
+from sagesplat.formats.splats import read_splat, scene_writer, write_splat, writer_of
 from sagesplat.io.typed import check_limits
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene import load_scene
@@ -48,6 +50,8 @@ def clean_splat(
     emit(StageStarted("clean"))
     begin = time.perf_counter()
     splat = read_splat(source)
+    for note in splat.notes:
+        emit(Warned(f"{source}: {note}"))
     for reason, count in splat.dropped.items():
         emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
     check_size(splat.gaussians, str(source))
@@ -122,13 +126,16 @@ def _scene_of(path: Path, cameras: Sequence[Camera]) -> Scene:
 
 def _write(source: Path, out: Path, splat: Splat, keep: np.ndarray) -> None:
     """Write the Gaussians that stay; from PLY to PLY their rows with all properties that the file has."""
-    if splat.kind == "PLY" and out.suffix.lower() == ".ply":
-        g = read_ply_splat(source).gaussians
-        drawn = ~torch.stack(list(undrawable(g).values())).any(0).numpy()
-        labelled_here = torch.equal(g.label_ids[torch.from_numpy(drawn)], splat.gaussians.label_ids)
-        if labelled_here:  # and not by a file beside it
-            drawn[drawn] = keep
-            select_ply(source, out, drawn)
-            return
     stays = splat.gaussians.select(torch.from_numpy(keep))
-    write_splat(out, stays, splat.names, antialiased=splat.antialiased)
+    if splat.kind != "PLY" or writer_of(out) is not PLY_WRITER:
+        write_splat(out, stays, splat.names, parents=splat.parents, antialiased=splat.antialiased)
+        return
+    g = read_ply_splat(source).gaussians
+    drawn = ~torch.stack(list(undrawable(g).values())).any(0).numpy()
+    labelled_here = torch.equal(g.label_ids[torch.from_numpy(drawn)], splat.gaussians.label_ids)
+    drawn[drawn] = keep
+    select_ply(source, out, drawn)
+    if labelled_here:  # and not by a file beside it
+        sidecar(out).unlink(missing_ok=True)
+    else:
+        write_or_remove_labels(out, stays.label_ids, splat.names, splat.parents)

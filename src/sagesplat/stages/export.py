@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,7 @@ from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.sh import BASES
 from sagesplat.formats.increments import (
     INDEX,
     FileFormat,
@@ -22,6 +24,8 @@ from sagesplat.formats.increments import (
     write_increments,
 )
 from sagesplat.formats.lod_meta import LOD_META
+from sagesplat.formats.ply import WRITER as PLY_WRITER
+from sagesplat.formats.ply import write_ply
 from sagesplat.formats.splat import WriteLevels
 from sagesplat.formats.splats import write_splat, writer_of
 from sagesplat.raster import device_of, rasterize
@@ -57,8 +61,11 @@ def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]
     streams = any(one.format == "stream" for one in listed)
     g = read_increments(job.run.increments, listed) if streams else ladder.gaussians
     antialiased = job.antialiased and kind != "ply"
+    if kind == "ply":  # in the published layout, with all harmonics
+        g = classic(job, g)
+        g = replace(g, shN=torch.nn.functional.pad(g.shN, (0, 0, 0, BASES[-1] - g.shN.shape[1])))
     return write_increments(
-        folder, classic(job, g) if kind == "ply" else g, ladder.sizes, job.names(), replaces=ladder.replaces,
+        folder, g, ladder.sizes, job.names(), replaces=ladder.replaces,
         kind=kind, fine=ladder.levels if streams else (),
         antialiased=antialiased,
     )  # fmt: skip
@@ -74,16 +81,20 @@ def export_scene(
     levels: Sequence[int] = (),
     rasterize_mode: RasterizeMode | None = None,
     without: Sequence[str] = (),
+    labels_inside: bool = False,
 ) -> int:
     """Write a level or a composition, whole or some categories, in the format of the path's name.
 
     `labels` (none: all) and `without` name categories or instances; a category means its instances too. What
     is left out leaves holes, which an event names.
 
-    `rasterize_mode`: how the file will be drawn; None: `classic` for a PLY, else as the run was trained.
-    `lod-meta.json` gets `levels`, or all there are, as levels of detail. Returns the number of Gaussians.
+    `rasterize_mode`: how the file will be drawn; None: as the run was trained where the format says so, else
+    `classic`. `lod-meta.json` gets `levels`, or all there are, as levels of detail. `labels_inside`: a PLY
+    has the labels as a property, not beside it. Returns the number of Gaussians.
     """
     writer = writer_of(path)
+    if labels_inside and writer is not PLY_WRITER:
+        raise RunError(f"{path}: --labels-inside is for .ply; leave it out")
     if rasterize_mode == "antialiased" and not job.antialiased:
         raise RunError(f"{job.run.path}: trained without antialiasing; leave out --rasterize-mode")
     if rasterize_mode == "classic" and writer.write_levels:
@@ -109,11 +120,16 @@ def export_scene(
     g = whole.of_labels(wanted)
     if gone:
         job.emit(Warned(_holes(job, whole, g, without)))
+    if g.sh_degree > writer.sh_degree and bool(g.shN.any()):
+        job.emit(Warned(f"{path}: the format holds no harmonics, which are left out"))
     mode = rasterize_mode or ("antialiased" if writer.antialiases else "classic")
-    if mode == "classic":
-        write_splat(path, classic(job, g), job.names(), parents=job.parents_by_id)
+    antialiased = mode == "antialiased" and job.antialiased
+    g = g if antialiased else classic(job, g)
+    kept = {"parents": job.parents_by_id, "antialiased": antialiased}
+    if labels_inside:
+        write_ply(path, g, job.names(), **kept, labels_inside=True)
     else:
-        write_splat(path, g, job.names(), parents=job.parents_by_id, antialiased=job.antialiased)
+        write_splat(path, g, job.names(), **kept)
     return len(g)
 
 

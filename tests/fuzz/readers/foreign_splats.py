@@ -21,6 +21,7 @@ from sagesplat.formats.spz import encode_spz
 from tests.fuzz.hostile import MIB, Reader
 from tests.fuzz.readers.making import as_json, file, put, splats, written
 
+COLOURS = ("red", "green", "blue")
 BANDS = {0: 0, 3: 1, 8: 2, 15: 3}
 
 
@@ -182,7 +183,46 @@ def _compressed(folder: Path, size: int) -> list[bytes]:
 
 
 def _named(folder: Path, size: int) -> list[bytes]:
-    return [written(folder / "n.ply", lambda path: write_ply(path, splats(3 * size), {2: "sky", 5: "tree"}))]
+    def write(path: Path) -> None:
+        write_ply(path, splats(3 * size), {2: "sky", 5: "tree"}, labels_inside=True)
+
+    if size > 1:
+        return [written(folder / "n.ply", write)]
+    lists = b"element face 2\nproperty list uchar int vertex_indices\nelement camera 1\nproperty double fx\n"
+    head, _, body = written(folder / "n.ply", write).partition(b"end_header\n")
+    head = head.replace(b"element vertex", lists + b"element vertex").replace(b"float nx", b"float filter_3D")
+    return [written(folder / "n.ply", write), head + b"end_header\n\1" + bytes(13) + body]
+
+
+def _text(folder: Path, size: int) -> list[bytes]:
+    names = ["x", "y", "z", "opacity", "rot_0", "rot_1", "rot_2", "rot_3", "scale_0", "scale_1", "scale_2"]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element camera 1",
+        "property float fx",
+        f"element vertex {3 * size}",
+    ]
+    header += [*(f"property float {name}" for name in names), *(f"property uchar {c}" for c in COLOURS)]
+    row = " ".join(["0.5"] * len(names) + ["7"] * 3)
+    return ["\n".join([*header, "end_header", "500", *[row] * (3 * size), ""]).encode()]
+
+
+def _archives(folder: Path, size: int) -> list[bytes]:
+    def packed(files: dict[str, bytes]) -> bytes:
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in files.items():
+                archive.writestr(name, content)
+        return buffer.getvalue()
+
+    ply = written(folder / "n.ply", lambda path: write_ply(path, splats(3 * size)))
+    if size > 1:
+        return [packed({"a.splat": dotsplat(1) * 3 * size})]
+    files = sorted(put_sog(folder / "0_0", *sog(6, 0)).parent.iterdir())
+    level = {f"0_0/{path.name}": path.read_bytes() for path in files}
+    description = json.dumps(streamed()).replace("1_0/", "0_0/").encode()
+    return [packed({"x/a.ply": ply}), packed(level | {"lod-meta.json": description})]
 
 
 def _sogs(folder: Path, size: int) -> list[bytes]:
@@ -252,6 +292,8 @@ def _read_labels(folder: Path, content: bytes) -> None:
 
 READERS = (
     Reader("splat-ply", ".ply", _named, file("n.ply", read_splat)),
+    Reader("text-ply", ".ply", _text, file("t.ply", read_splat), 100, 4 * MIB),
+    Reader("archive", ".zip", _archives, file("a.zip", read_splat), 1000, 16 * MIB),
     Reader("spz-4", ".spz", _spz_4, file("z.spz", read_splat), 10_000),
     Reader("compressed-ply", ".ply", _compressed, file("c.ply", read_splat)),
     Reader("sog", ".sog", _sogs, file("s.sog", read_splat), 1000, 16 * MIB),

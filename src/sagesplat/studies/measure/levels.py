@@ -51,6 +51,8 @@ def levels_of(path: Path) -> list[Level]:
     if count == 1:
         return [Level(name, "files", stored_bytes(path), partial(read_splat, path))]
     file = path / LOD_META if path.is_dir() else path
+    if file.name != LOD_META:
+        raise DataError(f"{path}: an archive of {count} levels; unpack it, and give its {LOD_META}")
     series = repaired(path.resolve().name if path.is_dir() else path.resolve().parent.name)
     return [
         Level(

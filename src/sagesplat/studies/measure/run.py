@@ -46,6 +46,8 @@ def measure(
     check_limits(config)
     reference, levels, names = _levels(paths)
     truth = reference.load()
+    for note in truth.notes:
+        emit(Warned(f"{reference.name}: {note}"))
     if truth.dropped:
         what = ", ".join(f"{count:,} {reason}" for reason, count in truth.dropped.items())
         emit(Warned(f"{reference.name}: Gaussians left out: {what}"))
