@@ -38,7 +38,9 @@ def evaluate(rows: list[tuple[float, int, float, float]]) -> Evaluation:
     f = np.float32
     measured = (predicted.astype(f), one, ssim.astype(f), 30 * one, one, 33 * one)
     kind = zero + QUALITIES.index("ssim")
-    return Evaluation(kind, target.astype(f), zero, label.astype(np.int32), zero, *measured, zero, *[one] * 12)
+    return Evaluation(
+        kind, target.astype(f), zero, label.astype(np.int32), zero, *measured, zero, *[one] * 12
+    )
 
 
 def as_text(table: tables.Table, path) -> list[dict[str, str]]:
