@@ -15,6 +15,7 @@ from jaxtyping import Bool
 from sagesplat import __version__
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.names import repaired
 from sagesplat.core.sh import BASES
 from sagesplat.formats.labels import sidecar, write_labels
@@ -22,6 +23,7 @@ from sagesplat.formats.splat import Splat, SplatReader, SplatWriter
 from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import read_header
 
+_SOME = 2**16  # Gaussians that say how far from the origin doubles are
 ROWS = 4096  # Gaussians per block, so that a block fits into the processor's cache
 
 
@@ -101,7 +103,9 @@ def read_ply(path: Path | str) -> Gaussians:
         >>> g.of_labels([184]).nbytes  # doctest: +SKIP
     """
     path = Path(path)
-    columns, labels, wanted, _ = _read(path)
+    columns, labels, wanted, _, offset = _read(path)
+    if any(offset):
+        columns[:3] += np.array(offset, np.float32)[:, None]
     _check_values(path, columns, wanted)
     return _gaussians(columns, labels)
 
@@ -111,9 +115,10 @@ def read_ply_splat(path: Path) -> Splat:
 
     Category names are those of comments such as `label 184 tree-merged`. DataError for other defects.
     """
-    columns, labels, _, comments = _read(path)
+    columns, labels, _, comments, offset = _read(path)
     names, parents = (_names(comments, word) for word in ("label", "parent"))
-    return Splat(_gaussians(columns, labels), "PLY", names, is_antialiased(comments), parents=parents)
+    g, antialiased = _gaussians(columns, labels), is_antialiased(comments)
+    return Splat(g, "PLY", names, antialiased, parents=parents, offset=offset)
 
 
 def select_ply(source: Path, target: Path, keep: Bool[np.ndarray, " N"]) -> None:
@@ -174,22 +179,25 @@ def _names(comments: Iterable[str], word: str) -> dict[int, str]:
     return names
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray, list[str], tuple[str, ...]]:
-    """Float32 columns [P, N], labels [N], the columns' names, and the header's comments."""
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray, list[str], tuple[str, ...], Position]:
+    """Float32 columns [P, N], labels [N], the columns' names, the header's comments, and an offset.
+
+    The offset was subtracted from positions that are doubles.
+    """
     try:
         with path.open("rb") as file:
             header = read_header(file)
             if not header.order:
                 raise DataError(f"{path}: text PLY is not supported; save it as binary_little_endian")
             wanted = _wanted(path, header.dtype)
-            columns, labels = _read_body(path, file, header.dtype, header.count, wanted)
+            columns, labels, offset = _read_body(path, file, header.dtype, header.count, wanted)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give a splat .ply") from None
     except ValueError as error:
         raise DataError(f"{path}: not readable as a PLY file ({short(error)}); give a splat .ply") from None
     if bad := int(np.count_nonzero((labels < -1) | (labels > 32767))):
         raise DataError(f"{path}: {bad} values of label are outside -1..32767; export the scene again")
-    return columns, labels, wanted, header.comments
+    return columns, labels, wanted, header.comments, offset
 
 
 def _properties(bases: int) -> list[str]:
@@ -244,14 +252,20 @@ def _wanted(path: Path, dtype: np.dtype) -> list[str]:
 
 def _read_body(
     path: Path, file: BinaryIO, dtype: np.dtype, count: int, wanted: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """The wanted columns as float32 [P, N] and the labels [N]."""
+) -> tuple[np.ndarray, np.ndarray, Position]:
+    """The wanted columns as float32 [P, N], the labels [N], and what was subtracted from the first three."""
     present = (path.stat().st_size - file.tell()) // dtype.itemsize
     if present < count:
         raise DataError(
             f"{path}: {count} Gaussians announced, {present} present; the file is truncated, copy it again"
         )
     columns = np.empty((len(wanted), count), np.float32)
+    offset, start = NO_OFFSET, file.tell()
+    if count and any(dtype[axis].itemsize == 8 for axis in "xyz"):
+        some = np.memmap(file, dtype, "r", start, (count,))[:: count // _SOME + 1]
+        offset = offset_of(np.stack([some[axis] for axis in "xyz"], axis=1))
+        file.seek(start)
+    by = dict(zip("xyz", offset, strict=True)) if any(offset) else {}
     labels = np.full(count, -1, np.int64)
     labelled = "label" in (dtype.names or ())
     for start in range(0, count, ROWS):
@@ -259,10 +273,10 @@ def _read_body(
         block = np.fromfile(file, dtype, rows.stop - start)
         with np.errstate(over="ignore"):  # a double too large for float32 is then reported as infinite
             for column, name in zip(columns, wanted, strict=True):
-                column[rows] = block[name]
+                column[rows] = block[name] - by[name] if name in by else block[name]
         if labelled:
             labels[rows] = _whole(block["label"])
-    return columns, labels
+    return columns, labels, offset
 
 
 def _whole(labels: np.ndarray) -> np.ndarray:

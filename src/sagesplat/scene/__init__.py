@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from sagesplat.core.errors import SceneError
+from sagesplat.core.geometry import offset_text
 from sagesplat.scene.detect import CAPTURES, detect
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -91,6 +92,8 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
         ("points", f"{len(points.xyz):,}" + ("" if len(points.track_points) else ", without tracks")),
         ("extent", f"{scene.extent:.3g} world units"),
     ]
+    if any(scene.offset):
+        rows.append(("offset", f"{offset_text(scene.offset)}, subtracted from all positions"))
     if len(points.track_points):
         depth, error = _depth_and_error(scene)
         length = len(depth) / len(np.unique(points.track_points))

@@ -20,6 +20,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.formats.levels import read_header, read_level, read_more, write_level, write_set
+from sagesplat.formats.splat import relative_to
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.io.typed import check_limits
 from sagesplat.run.job import Job
@@ -72,7 +73,8 @@ def open_splat(
     check_limits(config)
     own = job.run.capture / repaired(source.resolve().stem)
     photos = _make_capture(job, source, own, config, scene, labelled=not segmented)
-    open_scene(job, config.cameras if photos and config.cameras else own, scene)
+    offset = tuple(read_more(job.run.adopted, "offset").astype(float).tolist())
+    open_scene(job, config.cameras if photos and config.cameras else own, scene, offset=offset)
     if not segmented:
         masks = replace(masks, masks=own / "masks")
     make_masks(job, masks, labels)
@@ -110,6 +112,7 @@ def _make_capture(
         splat = read_splat(source, config.lod, spz_axes=config.spz_axes)
         for reason, count in splat.dropped.items():
             job.emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
+        splat = relative_to(splat, given[0].offset) if given else splat
         check_size(splat.gaussians, str(source))
         if labelled:
             splat = _labelled(splat)
@@ -135,7 +138,9 @@ def _make_capture(
             run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians{left_out}", how],
             antialiased=splat.antialiased, backend=job.backend,
         )  # fmt: skip
-        write_set(run.adopted, g, _LEVEL, exact=True, antialiased=splat.antialiased)
+        write_set(
+            run.adopted, g, _LEVEL, exact=True, antialiased=splat.antialiased, offset=np.array(splat.offset)
+        )  # fmt: skip
         return [
             f"{len(g):,} Gaussians ({splat.kind})",
             f"{len(cameras)} viewpoints, {run.contact_sheet}: {how}",

@@ -15,13 +15,14 @@ from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, Warned
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.offsets import read_offset, write_offset
 from sagesplat.formats.ply import read_ply_splat, select_ply
-from sagesplat.formats.splat import Splat, undrawable
+from sagesplat.formats.splat import Splat, relative_to, undrawable
 from sagesplat.formats.splats import read_splat, scene_writer, write_splat
 from sagesplat.io.typed import check_limits
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene import load_scene
-from sagesplat.scene.cameras import read_camera_file
+from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.stages.clean import CleanFigures, clean_lines, figures_of
@@ -51,8 +52,10 @@ def clean_splat(
     for reason, count in splat.dropped.items():
         emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
     check_size(splat.gaussians, str(source))
-    g, filtered = splat.gaussians.to(device_of(backend)), splat.antialiased
-    scene, photos, how = _views(g, filtered, cameras, backend)
+    given = [] if cameras is None else read_camera_file(cameras)
+    seen = relative_to(splat, given[0].offset) if given else splat
+    g, filtered = seen.gaussians.to(device_of(backend)), splat.antialiased
+    scene, photos, how = _views(g, filtered, cameras, given, backend)
     real, rows = not isinstance(photos, Renders), list(range(len(scene.views)))
     floaters = find_floaters(
         g, scene, rows,
@@ -93,14 +96,13 @@ def _check_paths(source: Path, out: Path, picture: Path | None, config: CleanCon
 
 
 def _views(
-    g: Gaussians, antialiased: bool, cameras: Path | None, backend: Backend
+    g: Gaussians, antialiased: bool, cameras: Path | None, given: Sequence[NamedCamera], backend: Backend
 ) -> tuple[Scene, Photos, str]:
     """Where to look from, what is seen there, and where that comes from."""
     if cameras is None:
         drawn = free_cameras(g, _VIEWS, up="auto", fov=_FOV, size=_SIZE, seed=0, kind="auto", backend=backend)
         scene = _scene_of(Path(), drawn.cameras)
         return scene, Renders(g, scene.views, backend, antialiased), _DRAWN
-    given = read_camera_file(cameras)
     if all(one.photo is not None for one in given):
         scene = load_scene(cameras, test_every=0)
         scene = replace(scene, views=tuple(replace(v, camera=v.camera.within(_SIDE)) for v in scene.views))
@@ -129,6 +131,7 @@ def _write(source: Path, out: Path, splat: Splat, keep: np.ndarray) -> None:
         if labelled_here:  # and not by a file beside it
             drawn[drawn] = keep
             select_ply(source, out, drawn)
+            write_offset(out, read_offset(source))
             return
     stays = splat.gaussians.select(torch.from_numpy(keep))
-    write_splat(out, stays, splat.names, antialiased=splat.antialiased)
+    write_splat(out, stays, splat.names, antialiased=splat.antialiased, offset=splat.offset)

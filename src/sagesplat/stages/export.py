@@ -13,6 +13,7 @@ from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import offset_text
 from sagesplat.formats.increments import (
     INDEX,
     FileFormat,
@@ -22,6 +23,7 @@ from sagesplat.formats.increments import (
     write_increments,
 )
 from sagesplat.formats.lod_meta import LOD_META
+from sagesplat.formats.offsets import beside, write_offset
 from sagesplat.formats.splat import WriteLevels
 from sagesplat.formats.splats import write_splat, writer_of
 from sagesplat.raster import device_of, rasterize
@@ -43,7 +45,16 @@ def export_increments(job: Job, folder: Path, kind: FileFormat) -> int:
         raise RunError(f"{job.run.path}: these levels have no chunks; use --ladder nested")
     if folder.exists() and not (job.force and (folder / INDEX).exists()):
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
-    return len(increment_files(job, folder, kind))
+    count = len(increment_files(job, folder, kind))
+    _say_offset(job, "which the files do not say")
+    return count
+
+
+def _say_offset(job: Job, where: str) -> None:
+    """Say what positions are relative to: no format of splats holds coordinates such as those in UTM."""
+    if any(offset := job.scene.offset):
+        text = offset_text(offset)
+        job.emit(Warned(f"positions are relative to {text}, {where}: add it for those of the capture"))
 
 
 def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]:
@@ -109,11 +120,15 @@ def export_scene(
     g = whole.of_labels(wanted)
     if gone:
         job.emit(Warned(_holes(job, whole, g, without)))
+    offset = job.scene.offset
     mode = rasterize_mode or ("antialiased" if writer.antialiases else "classic")
     if mode == "classic":
-        write_splat(path, classic(job, g), job.names(), parents=job.parents_by_id)
+        write_splat(path, classic(job, g), job.names(), parents=job.parents_by_id, offset=offset)
     else:
-        write_splat(path, g, job.names(), parents=job.parents_by_id, antialiased=job.antialiased)
+        write_splat(
+            path, g, job.names(), parents=job.parents_by_id, antialiased=job.antialiased, offset=offset
+        )  # fmt: skip
+    _say_offset(job, f"written to {beside(path).name}")
     return len(g)
 
 
@@ -142,7 +157,8 @@ def _alpha(job: Job, g: Gaussians, camera: Camera) -> Tensor:
 def _check_folder(job: Job, folder: Path) -> None:
     """RunError unless `folder` is new, empty, or with --force holds an earlier export and nothing else."""
     inside = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
-    other = [name for name in inside if name != LOD_META and not re.fullmatch(r"\d+_\d+", name)]
+    ours = (LOD_META, beside(folder / LOD_META).name)
+    other = [name for name in inside if name not in ours and not re.fullmatch(r"\d+_\d+", name)]
     if other or (inside and not job.force) or (folder.exists() and not folder.is_dir()):
         raise RunError(f"{folder}: not empty; choose a new folder (--force replaces one that export wrote)")
 
@@ -154,4 +170,6 @@ def _export_levels(
     sets = [job.ladder.load(level, wanted) for level in chosen]
     sets = [g for i, g in enumerate(sets) if len(g) and (i == 0 or len(g) < len(sets[i - 1]))]
     write(path, sets, job.names(), job.parents_by_id, job.antialiased)
+    write_offset(path, job.scene.offset)
+    _say_offset(job, f"written to {beside(path).name}")
     return len(sets[0]) if sets else 0
