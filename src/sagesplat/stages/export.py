@@ -45,9 +45,11 @@ def export_increments(job: Job, folder: Path, kind: FileFormat) -> int:
         raise RunError(f"{job.run.path}: these levels have no chunks; use --ladder nested")
     if folder.exists() and not (job.force and (folder / INDEX).exists()):
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
-    count = len(increment_files(job, folder, kind))
+    written = increment_files(job, folder, kind)
+    if other := sum(one.format != kind for one in written):
+        job.emit(Warned(f"{other} files are PLY: SPZ's steps of positions are larger than their Gaussians"))
     _say_offset(job, "which the files do not say")
-    return count
+    return len(written)
 
 
 def _say_offset(job: Job, where: str) -> None:
