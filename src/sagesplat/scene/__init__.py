@@ -9,6 +9,7 @@ import numpy as np
 from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import offset_text
 from sagesplat.scene.detect import CAPTURES, detect
+from sagesplat.scene.given_masks import GivenMasks
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import read_scene
@@ -105,7 +106,15 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
         ]
     masks = scene.path / "masks"
     num_masks = len(list(masks.glob("**/*.png")))
-    rows.append(("masks", f"{num_masks} label images in {masks.name}/" if num_masks else "no masks/ folder"))
+    photos = scene.views[0].image_path.parents[scene.views[0].name.count("/")]
+    given = GivenMasks([scene.path, photos.parent], photos)
+    if found := sum(given.of(view.name) is not None for view in views):
+        of = ", ".join(f"{folder.name}/" for folder in given.folders) or "the folder of the photos"
+        rows.append(("pixels that count", f"masks of {found} of {len(views)} photos in {of}"))
+    if num_masks and masks not in given.folders:
+        rows.append(("masks", f"{num_masks} label images in {masks.name}/"))
+    elif not found:
+        rows.append(("masks", "no masks/ folder"))
     return rows
 
 

@@ -13,8 +13,9 @@ from PIL import Image, ImageOps
 from sagesplat.core.names import cleaned, clipped, collision_key
 from sagesplat.io.files import atomic_path, link
 from sagesplat.io.pictures import PictureError, open_picture
-from sagesplat.scene.detect import PHOTOS, VALID_FOLDER
+from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.exif import DETAILS, exif_of
+from sagesplat.scene.given_masks import FOLDERS, holds_masks, is_mask_among
 from sagesplat.scene.images import as_rgb
 
 _LONGEST, _ROOM = 250, 30  # bytes of a name, and what is left of them for suffixes
@@ -73,17 +74,26 @@ def prepare_photos(
 
 def _list(source: Path, skipped: Path) -> list[Path]:
     """Photos below a folder, without hidden ones and masks, sorted by name with numbers by value."""
-    skipped, masks = skipped.resolve(), source / VALID_FOLDER
+    skipped, masks = skipped.resolve(), [source / name for name in FOLDERS if _holds_no_photos(source / name)]
     outside = not source.resolve().is_relative_to(skipped)
     photos = []
     for path in source.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(source).parts)
-        hidden |= path.is_relative_to(masks)
+        hidden |= any(path.is_relative_to(folder) for folder in masks)
         if path.suffix.lower() not in PHOTOS or hidden or not path.is_file():
             continue
         if not (outside and path.resolve().is_relative_to(skipped)):
             photos.append(path)
+    names: dict[Path, set[str]] = {}
+    for path in photos:
+        names.setdefault(path.parent, set()).add(path.name.lower())
+    photos = [path for path in photos if not is_mask_among(path, frozenset(names[path.parent]))]
     return sorted(photos, key=_by_number)
+
+
+def _holds_no_photos(folder: Path) -> bool:
+    """Whether a folder of a name for masks holds masks, or label images."""
+    return (folder / "labels.json").exists() or holds_masks(folder)
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:

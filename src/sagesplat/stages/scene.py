@@ -20,6 +20,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
 from sagesplat.scene.feature_masks import OfPhoto
+from sagesplat.scene.given_masks import holds_masks
 from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.edit import ignored_ids, parse_merge, parse_names
@@ -187,7 +188,8 @@ class _LeavingOut:
     def folder(self) -> Path | None:
         """Label images whose ignored categories are known before there are poses."""
         given = self.labels.ignore and self.masks.segmenter in ("auto", "masks")
-        return self.masks.masks if given else None
+        folder = self.masks.masks if given else None
+        return None if folder is not None and holds_masks(folder) else folder
 
     @property
     def settings(self) -> dict[str, Any]:
