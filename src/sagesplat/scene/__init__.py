@@ -8,6 +8,7 @@ import numpy as np
 
 from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import offset_text
+from sagesplat.io.colour_profile import describe_profiles
 from sagesplat.scene.detect import CAPTURES, detect
 from sagesplat.scene.given_masks import GivenMasks
 from sagesplat.scene.images import Photos
@@ -104,6 +105,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
             ("reprojection error", f"{np.median(error):.2f} px median"),
             ("depth of points", f"{near:.3g} nearest, {middle:.3g} median, {far:.3g} farthest"),
         ]
+    rows += [("colours", line) for line in describe_profiles(view.image_path for view in views)]
     masks = scene.path / "masks"
     num_masks = len(list(masks.glob("**/*.png")))
     photos = scene.views[0].image_path.parents[scene.views[0].name.count("/")]

@@ -11,6 +11,7 @@ from typing import Any
 from PIL import Image, ImageOps
 
 from sagesplat.core.names import cleaned, clipped, collision_key
+from sagesplat.io.colour_profile import profile_of
 from sagesplat.io.files import atomic_path, link
 from sagesplat.io.pictures import PictureError, open_picture
 from sagesplat.scene.detect import PHOTOS
@@ -162,7 +163,9 @@ def _is_prepared(target: Path, size: tuple[int, ...], mtime_ns: int) -> bool:
 def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | None:
     """The photo as upright 8-bit RGB, or None if the file is that already; decodes it in both cases."""
     turned = _orientation(exif) > 1
+    content = image.info.get("icc_profile")
     as_is = image.format in ("JPEG", "MPO", "PNG") and image.mode == "RGB" and not turned
+    as_is = as_is and not (content and profile_of(content).kind == "other")
     if as_is and image.format == "PNG":
         with path.open("rb") as file:
             as_is = file.read(25)[24] == 8 and not image.has_transparency_data  # Pillow reads 16 bits as 8

@@ -9,6 +9,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from sagesplat.core.errors import SceneError
+from sagesplat.io.colour_profile import in_srgb
 from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.scene.scene import View
 from sagesplat.scene.undistort import undistort
@@ -191,13 +192,14 @@ def _version(path: Path) -> tuple[int, int] | None:
 
 
 def as_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
-    """The image, of any Pillow mode, as 8-bit RGB; alpha is composited over `background`.
+    """The image, of any Pillow mode, as 8-bit sRGB; alpha is composited over `background`.
 
     Decodes it. Returns `image` itself where it is RGB already.
     """
     image.load()
     if image.mode.startswith("I") or image.mode == "F":
         return _grey(image).convert("RGB")
+    image = in_srgb(image)
     if image.has_transparency_data:
         return _composited(image, background)
     return image if image.mode == "RGB" else image.convert("RGB")

@@ -11,6 +11,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.geometry import NO_OFFSET, Position, offset_text
 from sagesplat.core.names import repaired
+from sagesplat.io.colour_profile import describe_profiles
 from sagesplat.io.files import write_json
 from sagesplat.run.capture import Capture, Hashes, check_photos, fingerprint, photo_hashes, read_capture
 from sagesplat.run.job import Job
@@ -121,6 +122,7 @@ def open_scene(
         ]
         if any(scene.offset):
             lines.append(f"far from the origin: {offset_text(scene.offset)} is subtracted from all positions")
+        lines += describe_profiles(view.image_path for view in scene.views)
         if config.vignetting:
             lines.append(_of_lens(found))
         return lines
