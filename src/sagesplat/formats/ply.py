@@ -118,7 +118,8 @@ def read_ply_splat(path: Path) -> Splat:
     columns, labels, _, comments, offset = _read(path)
     names, parents = (_names(comments, word) for word in ("label", "parent"))
     g, antialiased = _gaussians(columns, labels), is_antialiased(comments)
-    return Splat(g, "PLY", names, antialiased, parents=parents, offset=offset)
+    up = vertical_axis(comments)
+    return Splat(g, "PLY", names, antialiased, parents=parents, offset=offset, up=up)
 
 
 def select_ply(source: Path, target: Path, keep: Bool[np.ndarray, " N"]) -> None:
@@ -165,6 +166,16 @@ def is_antialiased(comments: Iterable[str]) -> bool:
             case ["antialiased", "0" | "1" as value]:
                 said = value == "1"
     return said
+
+
+def vertical_axis(comments: Iterable[str]) -> str:
+    """Which way is up, where nerfstudio wrote it into the header; else "auto".
+
+    Its exports are of a world whose z is up. Others, such as Brush, write `Vertical axis: y` for either sign.
+    """
+    words = [comment.lower() for comment in comments]
+    written = any("nerfstudio" in word or "nerstudio" in word for word in words)  # it misspells itself
+    return "z" if written and "vertical axis: z" in words else "auto"
 
 
 def _names(comments: Iterable[str], word: str) -> dict[int, str]:

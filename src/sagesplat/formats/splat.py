@@ -30,6 +30,7 @@ class Splat:
     dropped: dict[str, int] = field(default_factory=dict)  # reason -> Gaussians that were left out
     parents: dict[int, str] = field(default_factory=dict)  # by label id of an instance: its category's name
     offset: Position = NO_OFFSET  # that was subtracted from the positions in the file, world units
+    up: str = "auto"  # which way is up, such as "z", if the file says so
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ def _make_capture(
             cameras = [view.camera for view in views]
             up, how = upward(cameras) * FLIP, f"those of {config.cameras}"
         else:
-            cameras, up, how = _cameras(job, g, given, config)
+            cameras, up, how = _cameras(job, splat, given, config)
             views = _views(own, cameras)
             _write_model(own / "sparse" / "0", g, views, _points(g, config.seed))
         _write_pictures(job, own, splat, views, labelled=labelled, photos=photos)
@@ -173,17 +173,20 @@ def _labelled(splat: Splat) -> Splat:
 
 
 def _cameras(
-    job: Job, g: Gaussians, given: Sequence[NamedCamera], config: AdoptConfig
+    job: Job, splat: Splat, given: Sequence[NamedCamera], config: AdoptConfig
 ) -> tuple[Sequence[Camera], np.ndarray, str]:
     """Where to look from, which direction is up there, and what that was decided by."""
     if given:
         cameras = [one.camera for one in given]
         return cameras, upward(cameras) * FLIP, f"those of {config.cameras}"
     drawn = free_cameras(
-        g, config.views, up=config.up, fov=config.fov, size=config.size, seed=config.seed, kind=config.kind,
-        backend=job.backend,
+        splat.gaussians, config.views, up=splat.up if config.up == "auto" else config.up, fov=config.fov,
+        size=config.size, seed=config.seed, kind=config.kind, backend=job.backend,
     )  # fmt: skip
-    return drawn.cameras, drawn.up, drawn.reason
+    reason = drawn.reason
+    if config.up == "auto" != splat.up:
+        reason = reason.replace("as given", "as nerfstudio wrote into the file")
+    return drawn.cameras, drawn.up, reason
 
 
 def _points(g: Gaussians, seed: int, most: int = _POINTS) -> np.ndarray:

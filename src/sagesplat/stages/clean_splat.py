@@ -55,7 +55,7 @@ def clean_splat(
     given = [] if cameras is None else read_camera_file(cameras)
     seen = relative_to(splat, given[0].offset) if given else splat
     g, filtered = seen.gaussians.to(device_of(backend)), splat.antialiased
-    scene, photos, how = _views(g, filtered, cameras, given, backend)
+    scene, photos, how = _views(g, seen, cameras, given, backend)
     real, rows = not isinstance(photos, Renders), list(range(len(scene.views)))
     floaters = find_floaters(
         g, scene, rows,
@@ -96,19 +96,25 @@ def _check_paths(source: Path, out: Path, picture: Path | None, config: CleanCon
 
 
 def _views(
-    g: Gaussians, antialiased: bool, cameras: Path | None, given: Sequence[NamedCamera], backend: Backend
+    g: Gaussians, splat: Splat, cameras: Path | None, given: Sequence[NamedCamera], backend: Backend
 ) -> tuple[Scene, Photos, str]:
     """Where to look from, what is seen there, and where that comes from."""
     if cameras is None:
-        drawn = free_cameras(g, _VIEWS, up="auto", fov=_FOV, size=_SIZE, seed=0, kind="auto", backend=backend)
+        drawn = free_cameras(
+            g, _VIEWS, up=splat.up, fov=_FOV, size=_SIZE, seed=0, kind="auto", backend=backend
+        )
         scene = _scene_of(Path(), drawn.cameras)
-        return scene, Renders(g, scene.views, backend, antialiased), _DRAWN
+        return scene, Renders(g, scene.views, backend, splat.antialiased), _DRAWN
     if all(one.photo is not None for one in given):
         scene = load_scene(cameras, test_every=0)
         scene = replace(scene, views=tuple(replace(v, camera=v.camera.within(_SIDE)) for v in scene.views))
         return scene, Photos(scene.views), f"{len(scene.views)} photos of {cameras}"
     scene = _scene_of(cameras, [one.camera.within(_SIDE) for one in given])
-    return scene, Renders(g, scene.views, backend, antialiased), f"{len(scene.views)} cameras of {cameras}"
+    return (
+        scene,
+        Renders(g, scene.views, backend, splat.antialiased),
+        f"{len(scene.views)} cameras of {cameras}",
+    )
 
 
 def _scene_of(path: Path, cameras: Sequence[Camera]) -> Scene:

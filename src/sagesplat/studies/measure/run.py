@@ -107,8 +107,8 @@ def _viewpoints(
     if config.cameras is None:
         size = config.size, max(1, round(0.75 * config.size))
         drawn = free_cameras(
-            truth.gaussians, config.views, up=config.up, fov=config.fov, size=size, seed=config.seed,
-            kind=config.kind, backend=backend,
+            truth.gaussians, config.views, up=truth.up if config.up == "auto" else config.up, fov=config.fov,
+            size=size, seed=config.seed, kind=config.kind, backend=backend,
         )  # fmt: skip
         names = [f"{i:03}" for i in range(1, len(drawn.cameras) + 1)]
         return list(drawn.cameras), names, [drawn.reason], truth.offset
