@@ -25,9 +25,9 @@ def load_scene(
 ) -> Scene:  # fmt: skip
     """Load a capture: posed photos and structure-from-motion points.
 
-    The format is detected: a COLMAP workspace, nerfstudio's transforms.json, a Blender scene, or a scene that
-    sagesplat stored. Photos and videos without poses are not captures: `photos.reconstruct` makes one of
-    them.
+    The format is detected: a COLMAP workspace, nerfstudio's transforms.json, a Blender scene, the folders of
+    Polycam (raw data) and Record3D, cameras of Metashape in XML, or a scene that sagesplat stored. Photos and
+    videos without poses are not captures: `photos.reconstruct` makes one of them.
 
     Args:
         path: Folder of the capture, or its transforms.json.
@@ -80,6 +80,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
         ("name", scene.name),
         ("path", str(scene.path)),
         ("views", f"{len(views)} ({splits})"),
+        *(("read", note) for note in scene.notes),
         ("image size", ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")),
         ("cameras", f"{len(Ks)} distinct intrinsics"),
         (

@@ -93,7 +93,9 @@ class _Transforms:
     val_filenames: list[str] | None = None
 
 
-def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+def load_transforms(
+    path: Path, *, downscale: int = 1, test_every: int = 8, content: dict[str, Any] | None = None
+) -> Scene:
     """The scene of nerfstudio's or instant-ngp's transforms.json; `path` is the file or its folder.
 
     With `downscale` N the photos are read from `images_N/` if the frames are in images/ and that folder
@@ -101,14 +103,15 @@ def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> S
     the split unless `test_every` is 0: `val` is used only without `test`, and unlisted frames are dropped.
     Points are read from `ply_file_path`, else made by `points.random_points`. They are in the frame of the
     poses: `applied_transform` has been applied to both. A frame's `mask_path` says which pixels count (not
-    black). Depths are not read. Raises SceneError.
+    black). Depths are not read. `content`: of a file of another format, in place of what `path` holds. Raises
+    SceneError.
     """
-    file = path if path.suffix == ".json" else path / "transforms.json"
+    file = path if path.suffix == ".json" or content else path / "transforms.json"
     check_settings(path, downscale, test_every)
-    content, frames = _read(file)
+    transforms, frames = _read(file, content)
     offset, points = offset_of(_positions(frames)), None
-    if content.ply_file_path is not None:
-        ply = file.parent / _inside(file, "ply_file_path", content.ply_file_path)
+    if transforms.ply_file_path is not None:
+        ply = file.parent / _inside(file, "ply_file_path", transforms.ply_file_path)
         points = read_points(ply, offset)
         if any(offset) and not any(offset_of(_positions(frames), points.xyz + np.array(offset))):
             offset, points = NO_OFFSET, read_points(ply)  # cameras that hardly moved, in a wide scene
@@ -116,7 +119,7 @@ def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> S
     views = _views(file, frames, downscale)
     test_names = None
     if test_every:
-        views, test_names = _listed_split(file, content, frames, views)
+        views, test_names = _listed_split(file, transforms, frames, views)
     views = _sorted(file, views, test_names)
     points = random_points(views) if points is None else points
     folder = file.parent
@@ -196,9 +199,9 @@ def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool, Position]
     return found, None not in photos, offset
 
 
-def _read(file: Path) -> tuple[_Transforms, list[_Frame]]:
+def _read(file: Path, content: dict[str, Any] | None = None) -> tuple[_Transforms, list[_Frame]]:
     """The content of a transforms file, and its frames with the file's shared values filled in."""
-    content = read_json(file, _CURE, SceneError)
+    content = read_json(file, _CURE, SceneError) if content is None else content
     cure = 'export the transforms again, with {"frames": [...]} in them'
     with refused(file, "a transforms file", cure, SceneError):
         transforms = convert_as(content, _Transforms)

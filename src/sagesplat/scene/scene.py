@@ -123,6 +123,7 @@ class Scene:
     test_names: frozenset[str] | None = None  # overrides test_every: test views that the data set lists
     calibration_names: frozenset[str] | None = None  # likewise overrides calibrate_every
     alpha: Literal["auto", "background", "ignore"] = "auto"  # what transparent pixels mean (`SceneConfig`)
+    notes: tuple[str, ...] = ()  # what was decided while it was read, a line each
     offset: Position = NO_OFFSET  # that was subtracted from all positions of the capture, world units
 
     @cached_property

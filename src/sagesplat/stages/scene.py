@@ -119,6 +119,7 @@ def open_scene(
         lines = [
             f"{len(scene.train_ids)} training, {len(scene.test_ids)} test views, {size.width}x{size.height}",
             f"{len(scene.points.xyz):,} points",
+            *scene.notes,
         ]
         if any(scene.offset):
             lines.append(f"far from the origin: {offset_text(scene.offset)} is subtracted from all positions")
