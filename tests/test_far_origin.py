@@ -130,6 +130,9 @@ def test_what_is_near_stays_where_it_is(tmp_path):
     wide = np.random.default_rng(0).normal(size=(50, 3)) * 3
     assert offset_of(camera, wide) == NO_OFFSET  # cameras that hardly move, in a scene of some size
     assert any(offset_of(camera))  # nothing else is known: moving is right, too
+    road = np.stack([np.linspace(0, 6e4, 50), np.zeros(50), np.zeros(50)], 1)
+    assert any(offset_of(road + UTM))  # long, but with steps of half a metre in float32
+    assert offset_of(road) == NO_OFFSET
     nan = np.array([[math.nan, 0, 0], [math.inf, 0, 0]])
     assert offset_of(nan) == offset_of(nan[:0]) == NO_OFFSET
     assert offset_of(np.full((3, 3), 1e30)) == NO_OFFSET
