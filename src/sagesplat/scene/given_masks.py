@@ -47,8 +47,8 @@ class GivenMasks:
     def __init__(self, bases: Sequence[Path], photos: Path, more: Path | None = None):
         """`bases`: folders that may hold mask folders; `photos`: of the photos; `more`: a folder of masks."""
         places = [more] if more is not None else []
-        places += [base / name for base in dict.fromkeys(bases) for name in FOLDERS]
-        self.folders = [folder for folder in places if folder.is_dir() and holds_masks(folder)]
+        places += [folder for base in dict.fromkeys(bases) for folder in mask_folders(base)]
+        self.folders = [folder for folder in places if holds_masks(folder)]
         self._indices = [(folder, _index(folder)) for folder in self.folders]
         self._among = _index(photos) if photos.is_dir() else {}
 
@@ -59,12 +59,13 @@ class GivenMasks:
         """The mask of a photo, by its name below the folder of the photos."""
         names = list(_names(photo))
         for folder, index in self._indices:
-            inverted = folder.name == INVERTED_FOLDER
+            inverted = folder.name.lower() == INVERTED_FOLDER
             for name, turned in names:
                 if name in index:
                     return GivenMask(index[name], inverted ^ turned)
         for name, turned in names:
-            if "mask" in PurePosixPath(name).name and photo.lower() != name and name in self._among:
+            named = "mask" in PurePosixPath(name).name and photo.lower() != name
+            if named and name in self._among and _is_two_valued(self._among[name]):
                 return GivenMask(self._among[name], turned)
         return None
 
@@ -96,10 +97,18 @@ def _index(folder: Path) -> dict[str, Path]:
     return {path.relative_to(folder).as_posix().lower(): path for path in files}
 
 
+def mask_folders(base: Path) -> list[Path]:
+    """The folders in one that are named for masks, in the order of `FOLDERS`."""
+    if not base.is_dir():
+        return []
+    named = [path for path in base.iterdir() if path.name.lower() in FOLDERS and path.is_dir()]
+    return sorted(named, key=lambda path: FOLDERS.index(path.name.lower()))
+
+
 def holds_masks(folder: Path) -> bool:
     """Whether a folder's pictures are masks rather than label images: of two values, without labels.json."""
-    if folder.name in (VALID_FOLDER, INVERTED_FOLDER, ".mask"):
-        return True
+    if folder.name.lower() in (VALID_FOLDER, INVERTED_FOLDER, ".mask"):
+        return folder.is_dir()
     if (folder / "labels.json").exists():
         return False
     files = list(_index(folder).values())

@@ -141,7 +141,8 @@ class _Given:
         self.raw = raw_photos(scene.path) if masks else {}
         self.found = {view.name: mask for view in scene.views if (mask := masks.of(view.name)) is not None}
         # structure from motion may have left out all photos with a mask, and wrote the folder itself
-        if masks.folders and not self.raw and not self.found:
+        named = any(view.valid_path for view in scene.views)  # by their capture, whatever they are called
+        if masks.folders and not self.raw and not self.found and not named:
             name = mask_path(masks.folders[0], scene.views[0]).name
             raise LabelError(
                 f"{masks.folders[0]}: no mask of any photo; name them like the photos ({name}, ...)"
