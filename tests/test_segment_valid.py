@@ -10,6 +10,8 @@ from PIL import Image
 
 from sagesplat.core.errors import LabelError, SceneError
 from sagesplat.scene import describe
+from sagesplat.scene._prepare import prepare_photos
+from sagesplat.scene.feature_masks import write_feature_masks
 from sagesplat.scene.given_masks import VALID_FOLDER as FOLDER
 from sagesplat.scene.given_masks import holds_masks, is_mask_among
 from sagesplat.scene.images import read_black
@@ -254,3 +256,30 @@ def test_transparent_pixels_of_a_mask_do_not_count(tmp_path):
     pixels[:2, :, 3] = 0
     Image.fromarray(pixels).save(tmp_path / "a.png")
     assert read_black(tmp_path / "a.png", 16).tolist() == [[False] * 4] * 2 + [[True] * 4] * 2
+
+
+def test_masks_are_no_photos_to_find_poses_of(tmp_path):
+    """Those beside photos without poses, in any of the places; and structure from motion heeds them."""
+    photo = np.random.default_rng(0).integers(0, 255, (32, 48, 3), np.uint8)
+    for name in ("a.jpg", "sub/b.jpg", "c_mask.jpg"):
+        path = tmp_path / "in" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(photo).save(path)
+    mask = Image.new("L", (48, 32))
+    mask.paste(255, (24, 0, 48, 32))
+    for name in ("a.jpg.mask.png", "masks/sub/b.png", ".mask/c_mask.png"):
+        path = tmp_path / "in" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mask.save(path)
+    photos, unreadable = prepare_photos(
+        tmp_path / "in", tmp_path / "prepared", tmp_path / "out", lambda done, total: None
+    )
+    assert [photo.path for photo in photos] == ["a.jpg", "c_mask.jpg", "sub/b.jpg"]
+    assert not unreadable
+    masks = write_feature_masks(
+        photos, tmp_path / "in", tmp_path / "masks", tmp_path / "out", "auto", lambda name: None
+    )
+    assert len(masks) == 3
+    for photo in photos:
+        with Image.open(tmp_path / "out" / "masks_valid" / Path(photo.final).with_suffix(".png")) as image:
+            assert np.array_equal(np.asarray(image), np.asarray(mask))

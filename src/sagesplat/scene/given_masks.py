@@ -1,6 +1,6 @@
 """Masks that came with photos, under the names that trainers and photogrammetry give them.
 
-Folders beside the photos: masks_valid/, masks/, mask/, and .mask/ (a layer of RealityScan). Names, of x.jpg:
+Folders beside the photos: masks_valid/, masks/, mask/, segmentation/, .mask/ (RealityScan). Names, of x.jpg:
 x.png, x.jpg.png (COLMAP), x.jpg.mask.png (RealityScan, Brush), x.mask.png, x_mask.png (Metashape), and
 mask_x.png; or other pictures.
 Those with the word "mask" may also lie among the photos. Black pixels do not count, as in nerfstudio, COLMAP,
@@ -22,7 +22,7 @@ from sagesplat.scene.images import read_black
 
 VALID_FOLDER = "masks_valid"  # what is in it is never taken for label images
 INVERTED_FOLDER = "masks_inverted"
-FOLDERS = (VALID_FOLDER, "masks", "mask", ".mask", INVERTED_FOLDER)
+FOLDERS = (VALID_FOLDER, "masks", "mask", "segmentation", ".mask", INVERTED_FOLDER)
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _LOOKED_AT = 8  # images that tell masks from label images
 _BETWEEN = 0.02  # share of pixels that edges of masks may have between black and white
