@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sagesplat.core.config import AdoptConfig, LabelsConfig, MasksConfig, SceneConfig
-from sagesplat.core.errors import DataError
+from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, StageDone, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import NO_OFFSET, offset_of
@@ -228,6 +228,18 @@ def test_a_far_splat_is_adopted_and_exported(tmp_path):
     assert back.offset == job.scene.offset
     centre = (back.gaussians.means.double() + torch.tensor(back.offset)).mean(0) - torch.from_numpy(at)
     assert (centre - g.means.double().mean(0)).abs().max() < 0.01
+    export_scene(job, tmp_path / "wide.ply", level=2, labels=(), target=None, doubles=True)
+    with (tmp_path / "wide.ply").open("rb") as file:
+        header = read_header(file)
+        rows = np.fromfile(file, header.dtype, header.count)
+    assert {header.types[axis] for axis in "xyz"} == {"f8"}
+    assert not (tmp_path / "wide.ply.offset.xyz").exists()
+    wide = read_splat(tmp_path / "wide.ply")
+    assert np.abs(rows["x"].mean() - at[0] - g.means[:, 0].mean().item()) < 0.01
+    by = torch.tensor(wide.offset) - torch.tensor(back.offset)
+    assert (wide.gaussians.means + by - back.gaussians.means).abs().max() < 1e-5
+    with pytest.raises(RunError, match=r"wide\.spz: --doubles is for \.ply"):
+        export_scene(job, tmp_path / "wide.spz", level=2, labels=(), target=None, doubles=True)
 
 
 def test_spz_refuses_steps_that_are_larger_than_gaussians(tmp_path):

@@ -27,6 +27,7 @@ def export(
     chunks: Literal["spz", "ply"] | None = None,
     levels: tuple[StepNumber, ...] = (),
     rasterize_mode: Literal["classic", "antialiased"] | None = None,
+    doubles: bool = False,
     ladder: Ladder = "nested",
     machine: Annotated[Compute, Flat] = Compute(),
 ) -> None:
@@ -48,6 +49,8 @@ def export(
         levels: numbers of the levels that lod-meta.json gets (default: all)
         rasterize_mode: how viewers of the file draw (default: classic for .ply, as most do and no header
             tells them; .spz, .sog and lod-meta.json say how the run was trained)
+        doubles: write x y z of a .ply as doubles in the capture's own coordinates, such as UTM; viewers that
+            rely on the published layout then fail
         chunks: write the increment of each level of each category as a file of this format
     """
     from sagesplat.segment.edit import parse_names
@@ -55,6 +58,8 @@ def export(
 
     if chunks and (only or without):
         raise RunError(f"{out}: --only and --without are for one scene; leave them out with --chunks")
+    if chunks and doubles:
+        raise RunError(f"{out}: --doubles is for one scene; leave it out with --chunks")
     if chunks and rasterize_mode:
         raise RunError(f"{out}: --rasterize-mode is for one scene; leave it out with --chunks")
     if target_fidelity is not None and target_ssim is not None:
@@ -67,7 +72,7 @@ def export(
             target = target if target_fidelity is None else ("fidelity", target_fidelity)
             count = export_scene(
                 job, out, level=level, labels=parse_names(only, "only"), target=target, levels=levels,
-                rasterize_mode=rasterize_mode, without=parse_names(without, "without"),
+                rasterize_mode=rasterize_mode, without=parse_names(without, "without"), doubles=doubles,
             )  # fmt: skip
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 

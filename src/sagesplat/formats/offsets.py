@@ -13,6 +13,7 @@ from sagesplat.core.errors import DataError
 from sagesplat.core.geometry import NO_OFFSET, Position, offset_text
 from sagesplat.formats.splat import Splat
 from sagesplat.io.files import atomic_path, regular
+from sagesplat.io.ply_header import read_header
 
 _MOST = 1000  # bytes
 
@@ -54,3 +55,22 @@ def with_offset(splat: Splat, path: Path) -> Splat:
     """The splat with the offset that is beside its file `path` added to its own."""
     x, y, z = np.add(splat.offset, read_offset(path)).tolist()
     return replace(splat, offset=(x, y, z))
+
+
+def write_doubles(path: Path, offset: Position) -> None:
+    """Make the positions of a PLY that was just written doubles, with the offset added: none is beside it."""
+    with path.open("rb") as file:
+        header = read_header(file)
+        start = file.tell()
+        rows = np.fromfile(file, header.dtype, header.count)
+        file.seek(0)
+        head = file.read(start)
+    kinds = [(name, "<f8" if name in "xyz" else header.dtype[name]) for name in header.dtype.names or ()]
+    wide = rows.astype(kinds)
+    for axis, by in zip("xyz", offset, strict=True):
+        wide[axis] += by
+        head = head.replace(f"property float {axis}\n".encode(), f"property double {axis}\n".encode())
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(head)
+        wide.tofile(file)
+    write_offset(path, NO_OFFSET)

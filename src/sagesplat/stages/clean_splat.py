@@ -15,7 +15,8 @@ from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.offsets import read_offset, write_offset
+from sagesplat.core.geometry import offset_text
+from sagesplat.formats.offsets import beside, read_offset, write_offset
 from sagesplat.formats.ply import read_ply_splat, select_ply
 from sagesplat.formats.splat import Splat, relative_to, undrawable
 from sagesplat.formats.splats import read_splat, scene_writer, write_splat
@@ -79,6 +80,8 @@ def clean_splat(
             antialiased=filtered, backend=backend,
         )  # fmt: skip
     _write(source, out, splat, cleaned.keep)
+    if any(splat.offset) and beside(out).exists():
+        how = f"{how}; positions are relative to {offset_text(splat.offset)} ({beside(out).name})"
     emit(StageDone("clean", time.perf_counter() - begin, (*lines, how)))
     return figures
 

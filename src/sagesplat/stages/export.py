@@ -23,7 +23,7 @@ from sagesplat.formats.increments import (
     write_increments,
 )
 from sagesplat.formats.lod_meta import LOD_META
-from sagesplat.formats.offsets import beside, write_offset
+from sagesplat.formats.offsets import beside, write_doubles, write_offset
 from sagesplat.formats.splat import WriteLevels
 from sagesplat.formats.splats import write_splat, writer_of
 from sagesplat.raster import device_of, rasterize
@@ -87,16 +87,21 @@ def export_scene(
     levels: Sequence[int] = (),
     rasterize_mode: RasterizeMode | None = None,
     without: Sequence[str] = (),
+    doubles: bool = False,
 ) -> int:
     """Write a level or a composition, whole or some categories, in the format of the path's name.
 
     `labels` (none: all) and `without` name categories or instances; a category means its instances too. What
     is left out leaves holes, which an event names.
 
+    `doubles`: positions of a PLY are doubles in the capture's own coordinates.
+
     `rasterize_mode`: how the file will be drawn; None: `classic` for a PLY, else as the run was trained.
     `lod-meta.json` gets `levels`, or all there are, as levels of detail. Returns the number of Gaussians.
     """
     writer = writer_of(path)
+    if doubles and path.suffixes[-1:] != [".ply"]:
+        raise RunError(f"{path}: --doubles is for .ply; leave it out")
     if rasterize_mode == "antialiased" and not job.antialiased:
         raise RunError(f"{job.run.path}: trained without antialiasing; leave out --rasterize-mode")
     if rasterize_mode == "classic" and writer.write_levels:
@@ -130,7 +135,10 @@ def export_scene(
         write_splat(
             path, g, job.names(), parents=job.parents_by_id, antialiased=job.antialiased, offset=offset
         )  # fmt: skip
-    _say_offset(job, f"written to {beside(path).name}")
+    if doubles:
+        write_doubles(path, offset)
+    else:
+        _say_offset(job, f"written to {beside(path).name}")
     return len(g)
 
 
