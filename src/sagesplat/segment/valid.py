@@ -148,6 +148,8 @@ class _Given:
                 f"{masks.folders[0]}: no mask of any photo; name them like the photos ({name}, ...)"
             )
         self.line = self._line(scene) if self.found else ""
+        if named and not self.found:
+            self.line = "masks that the capture names: black pixels do not count"
 
     def __call__(self, view: View) -> Pixels:
         """Whether the pixels of a view count, at the size of its camera."""
