@@ -53,7 +53,13 @@ class GivenMasks:
         self._among = _index(photos) if photos.is_dir() else {}
 
     def __bool__(self) -> bool:
-        return bool(self.folders) or any("mask" in name for name in self._among)
+        return bool(self.places)
+
+    @property
+    def places(self) -> list[Path]:
+        """The folders, and the files among the photos that may be masks by their names."""
+        named = [path for name, path in self._among.items() if "mask" in PurePosixPath(name).name]
+        return [*self.folders, *(path for path in named if not _is_below(path, self.folders))]
 
     def of(self, photo: str) -> GivenMask | None:
         """The mask of a photo, by its name below the folder of the photos."""
@@ -68,6 +74,10 @@ class GivenMasks:
             if named and name in self._among and _is_two_valued(self._among[name]):
                 return GivenMask(self._among[name], turned)
         return None
+
+
+def _is_below(path: Path, folders: Sequence[Path]) -> bool:
+    return any(path.is_relative_to(folder) for folder in folders)
 
 
 def _names(photo: str) -> Iterator[tuple[str, bool]]:

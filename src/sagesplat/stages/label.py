@@ -67,8 +67,8 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
 
     settings = {name: value for name, value in asdict(labels).items() if name != "instances"}
     given = given_masks(job.scene, _mask_folder(config))
-    if given.folders:
-        settings["valid"] = [file_hash(folder) for folder in given.folders]
+    if given:
+        settings["valid"] = [file_hash(place) for place in given.places]
     inputs = [run.provenance("segment"), run.segmented / "labels.json"]
     inputs += {view.valid_path: None for view in job.scene.views if view.valid_path}
     run_stage(job, "masks", settings, inputs, [run.masks / "labels.json"], make)
