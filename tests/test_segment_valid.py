@@ -17,7 +17,7 @@ from sagesplat.scene.given_masks import holds_masks, is_mask_among
 from sagesplat.scene.images import read_black
 from sagesplat.scene.scene import Lens, Scene
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_mask
-from sagesplat.segment.valid import ALL_VALID, ValidPixels, ignores_alpha, write_valid
+from sagesplat.segment.valid import ALL_VALID, ValidPixels, describe_masks, ignores_alpha, write_valid
 
 PERSON, TREE = 1, 184
 TAXONOMY = Taxonomy({PERSON: "person", TREE: "tree-merged"})
@@ -181,7 +181,8 @@ def test_masks_of_other_trainers(tmp_path, scene, form):
     assert len(said) == 1
     assert "masks of 4 of 4 photos" in said[0]
     assert "black pixels do not count (if it is the white ones, name the folder masks_inverted)" in said[0]
-    assert dict(describe(scene))["pixels that count"].startswith("masks of 4 of 4 photos in ")
+    assert describe_masks(scene) == said[0]
+    assert "masks" not in dict(describe(scene))
 
 
 @pytest.mark.parametrize("form", ["masks_inverted/{stem}.png", "images/dynamic_mask_{stem}.png"])

@@ -111,12 +111,9 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
     num_masks = len(list(masks.glob("**/*.png")))
     photos = scene.views[0].image_path.parents[scene.views[0].name.count("/")]
     given = GivenMasks([scene.path, photos.parent], photos)
-    if found := sum(given.of(view.name) is not None for view in views):
-        of = ", ".join(f"{folder.name}/" for folder in given.folders) or "the folder of the photos"
-        rows.append(("pixels that count", f"masks of {found} of {len(views)} photos in {of}"))
     if num_masks and masks not in given.folders:
         rows.append(("masks", f"{num_masks} label images in {masks.name}/"))
-    elif not found:
+    elif not given:
         rows.append(("masks", "no masks/ folder"))
     return rows
 

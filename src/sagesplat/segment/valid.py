@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32
 from PIL import Image
 from scipy.ndimage import minimum_filter
 
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, SceneError
 from sagesplat.io.files import atomic_path
 from sagesplat.scene.given_masks import INVERTED_FOLDER, GivenMask, GivenMasks
 from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
@@ -186,6 +186,14 @@ class _Given:
             return False
         in_white, in_black = seen / area
         return bool(in_white < _HARDLY_ANY * in_black)
+
+
+def describe_masks(scene: Scene) -> str:
+    """A line on the masks that came with the photos of a scene, and which pixels count; "" without any."""
+    try:
+        return _Given(scene, None).line
+    except (LabelError, SceneError) as error:
+        return str(error)
 
 
 def given_masks(scene: Scene, folder: Path | None = None) -> GivenMasks:
