@@ -9,11 +9,15 @@ from conftest import random_gaussians, write_capture
 from PIL import Image
 
 from sagesplat.core.errors import LabelError, SceneError
-from sagesplat.scene.detect import VALID_FOLDER as FOLDER
+from sagesplat.scene import describe
+from sagesplat.scene._prepare import prepare_photos
+from sagesplat.scene.feature_masks import write_feature_masks
+from sagesplat.scene.given_masks import VALID_FOLDER as FOLDER
+from sagesplat.scene.given_masks import holds_masks, is_mask_among
 from sagesplat.scene.images import read_black
 from sagesplat.scene.scene import Lens, Scene
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, write_mask
-from sagesplat.segment.valid import ALL_VALID, ValidPixels, ignores_alpha, write_valid
+from sagesplat.segment.valid import ALL_VALID, ValidPixels, describe_masks, ignores_alpha, write_valid
 
 PERSON, TREE = 1, 184
 TAXONOMY = Taxonomy({PERSON: "person", TREE: "tree-merged"})
@@ -110,7 +114,7 @@ def test_masks_that_cannot_be_used(tmp_path, scene):
     with pytest.raises(LabelError, match=r"no mask of any photo; name them like the photos \(00.png"):
         write_valid(scene, tmp_path / "valid")
     path.write_bytes(b"GIF89a")
-    with pytest.raises(SceneError, match="not a readable PNG"):
+    with pytest.raises(SceneError, match="not a readable mask"):
         write_valid(scene, tmp_path / "valid")
     Image.new("1", (4, 4)).save(tmp_path / "00.png")
     with pytest.raises(LabelError, match="4 x 4 pixels where the scene has 48 x 32; make the masks again"):
@@ -143,3 +147,140 @@ def test_black_is_zero_in_every_channel(tmp_path):
     pixels[0, 1] = (0, 0, 9)
     Image.fromarray(pixels).save(tmp_path / "m.png")
     assert read_black(tmp_path / "m.png", 6).tolist() == [[False, True, False], [False] * 3]
+
+
+NAMES = (
+    "masks_valid/{stem}.png",
+    "masks/{stem}.png",
+    "masks/{name}.png",
+    "masks/{name}.mask.png",
+    "masks/{stem}_mask.png",
+    "masks/{stem}.jpg",
+    "mask/{stem}.PNG",
+    "mask/{stem}.mask.png",
+    ".mask/{stem}.png",
+    "images/{name}.mask.png",
+    "images/{stem}_mask.png",
+)
+
+
+@pytest.mark.parametrize("form", NAMES)
+def test_masks_of_other_trainers(tmp_path, scene, form):
+    """Black and white images are masks of what counts, under any usual name; it is said what was found."""
+    expected = np.ones((32, 48), bool)
+    expected[:, :24] = False
+    for view in scene.views:
+        path = scene.path / form.format(name=view.name, stem=Path(view.name).stem)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.where(expected, np.uint8(255), np.uint8(0))).save(path, quality=95)
+    said: list[str] = []
+    shares = write_valid(scene, tmp_path / "valid", say=said.append)
+    valid = ValidPixels(tmp_path / "valid")
+    assert all(np.array_equal(valid[view], expected) for view in scene.views)
+    assert shares.tolist() == [0.5] * 4
+    assert len(said) == 1
+    assert "masks of 4 of 4 photos" in said[0]
+    assert "black pixels do not count (if it is the white ones, name the folder masks_inverted)" in said[0]
+    assert describe_masks(scene) == said[0]
+    assert "masks" not in dict(describe(scene))
+
+
+@pytest.mark.parametrize("form", ["masks_inverted/{stem}.png", "images/dynamic_mask_{stem}.png"])
+def test_masks_whose_names_say_that_they_are_inverted(tmp_path, scene, form):
+    path = scene.path / form.format(stem=Path(scene.views[0].name).stem)
+    path.parent.mkdir(exist_ok=True)
+    pixels = np.zeros((32, 48), np.uint8)
+    pixels[:, :24] = 255
+    Image.fromarray(pixels).save(path)
+    said: list[str] = []
+    write_valid(scene, tmp_path / "valid", say=said.append)
+    valid = ValidPixels(tmp_path / "valid")[scene.views[0]]
+    assert valid is not None
+    assert not valid[:, :24].any()
+    assert valid[:, 24:].all()
+    assert "white pixels do not count, as their names say" in said[0]
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_points_tell_which_pixels_of_masks_count(tmp_path, scene, inverted):
+    """Where structure from motion found no point in white, it is the white pixels that do not count."""
+    rng = np.random.default_rng(0)
+    uv = rng.uniform(0, [24, 32], (100, 2)).astype(np.float32) + np.float32([24, 0])  # in the right half
+    tracks = np.zeros(100, np.int64), np.repeat(np.arange(4, dtype=np.int32), 25)
+    points = replace(scene.points, track_points=tracks[0], track_views=tracks[1], track_uv=uv)
+    scene = replace(scene, points=points)
+    for row in range(4):
+        path = black(scene.path / "masks", scene, row)
+        if inverted:
+            Image.fromarray(255 - np.asarray(Image.open(path))).save(path)
+    said: list[str] = []
+    write_valid(scene, tmp_path / "valid", say=said.append)
+    valid = ValidPixels(tmp_path / "valid")[scene.views[0]]
+    assert valid is not None
+    assert valid[:, 24:].all()
+    assert not valid[:, :24].any()
+    assert ("white pixels do not count, since the points" in said[0]) == inverted
+
+
+def test_label_images_are_no_masks(tmp_path):
+    """Neither those with a labels.json, nor images of other values than black and white."""
+    for name, values in {"ids": (3, 184), "many": (0, 1, 2), "void": (7, 255)}.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        pixels = np.resize(np.array(values, np.uint8), (8, 8))
+        Image.fromarray(pixels).save(folder / "a.png")
+        assert not holds_masks(folder)
+    for name, values in {"ones": (0, 1), "white": (255,), "black": (0,), "both": (0, 255)}.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        Image.fromarray(np.resize(np.array(values, np.uint8), (8, 8))).save(folder / "a.png")
+        assert holds_masks(folder)
+    (tmp_path / "both" / "labels.json").write_text("{}")
+    assert not holds_masks(tmp_path / "both")
+    assert not holds_masks(tmp_path / "missing")
+    soft = Image.linear_gradient("L").resize((8, 256))  # all greys
+    soft.save(tmp_path / "white" / "b.png")
+    assert not holds_masks(tmp_path / "white")
+
+
+def test_photos_named_like_masks_are_photos(tmp_path):
+    """A mask among photos is one that is black and white and named after another photo."""
+    names = frozenset(["a.jpg", "a_mask.png", "b_mask.jpg", "a.jpg.mask.png"])
+    for name in names:
+        Image.new("L", (8, 8), 255 if name.startswith("a") else 90).save(tmp_path / name)
+    found = {name for name in names if is_mask_among(tmp_path / name, names)}
+    assert found == {"a_mask.png", "a.jpg.mask.png"}
+
+
+def test_transparent_pixels_of_a_mask_do_not_count(tmp_path):
+    pixels = np.full((4, 4, 4), 255, np.uint8)
+    pixels[:2, :, 3] = 0
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert read_black(tmp_path / "a.png", 16).tolist() == [[False] * 4] * 2 + [[True] * 4] * 2
+
+
+def test_masks_are_no_photos_to_find_poses_of(tmp_path):
+    """Those beside photos without poses, in any of the places; and structure from motion heeds them."""
+    photo = np.random.default_rng(0).integers(0, 255, (32, 48, 3), np.uint8)
+    for name in ("a.jpg", "sub/b.jpg", "c_mask.jpg"):
+        path = tmp_path / "in" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(photo).save(path)
+    mask = Image.new("L", (48, 32))
+    mask.paste(255, (24, 0, 48, 32))
+    for name in ("a.jpg.mask.png", "masks/sub/b.png", ".mask/c_mask.png"):
+        path = tmp_path / "in" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mask.save(path)
+    photos, unreadable = prepare_photos(
+        tmp_path / "in", tmp_path / "prepared", tmp_path / "out", lambda done, total: None
+    )
+    assert [photo.path for photo in photos] == ["a.jpg", "c_mask.jpg", "sub/b.jpg"]
+    assert not unreadable
+    masks = write_feature_masks(
+        photos, tmp_path / "in", tmp_path / "masks", tmp_path / "out", "auto", lambda name: None
+    )
+    assert len(masks) == 3
+    for photo in photos:
+        with Image.open(tmp_path / "out" / "masks_valid" / Path(photo.final).with_suffix(".png")) as image:
+            assert np.array_equal(np.asarray(image), np.asarray(mask))

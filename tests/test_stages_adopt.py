@@ -26,6 +26,8 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_index
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.splats import read_splat, write_splat
+from sagesplat.metrics.image import ssim_map
+from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import pipeline
@@ -34,7 +36,8 @@ from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.api import open_run
 from sagesplat.stages.bundle import bundle
 from sagesplat.stages.export import export_scene
-from sagesplat.stages.results import promises_of
+from sagesplat.stages.methods import method_of
+from sagesplat.stages.results import promises_of, sampled_of, viewpoints_of
 
 SMALL = AdoptConfig(fit="none", views=14, size=(48, 36), shares=(0.2, 0.4, 0.7, 1.0), kind="object")
 REST = RunConfig(
@@ -89,6 +92,22 @@ def test_levels_end_with_what_came_in(adopted: Path) -> None:
         assert top.counts()[label] == count
         mine, theirs = (np.sort(g.of_labels([label]).means[:, 0].numpy()) for g in (top, before))
         np.testing.assert_allclose(mine, theirs, atol=0.01)  # SPZ's steps
+
+
+def test_fidelity_is_against_what_came_in(adopted: Path) -> None:
+    """The last level is rounded: what it loses is measured, and a target that it misses is out of reach."""
+    job = Job(RunDir(adopted), lambda event: None, "cpu")
+    drawn, table = viewpoints_of(job), sampled_of(job)
+    assert job.came_in is not None
+    camera = drawn.cameras[drawn.rows("fit")[0]]
+    images = [rasterize(g, camera).rgb.clamp(0, 1).numpy() for g in (job.ladder.load(4), job.came_in)]
+    assert table.whole[0, -1] == pytest.approx(ssim_map(*images).mean(), abs=1e-5)
+    top = table.fidelity[..., -1][table.pixels > 0]
+    assert (top < 1).any()
+    assert (top > 0.9).all()
+    method = method_of(job)
+    assert method.plan_scene(0.5, 0.95, "fidelity").status == "ok"
+    assert method.plan_scene(0.999999, 0.95, "fidelity").status == "infeasible"
 
 
 def test_a_run_without_photos_has_fidelity_and_no_ssim(adopted: Path) -> None:

@@ -116,6 +116,7 @@ def evaluate(
     others: Mapping[str, Similarity] | None = None,
     uniform: Sequence[int] = (),
     compose: Callable[[Plan], Gaussians] | None = None,
+    full: Gaussians | None = None,
     valid: ValidPixels = ALL_VALID,
     backend: Backend = "auto",
     antialiased: bool = False,
@@ -133,6 +134,7 @@ def evaluate(
         others: Of OTHERS, what to measure of whole images (image, photo); None: MS-SSIM.
         uniform: Levels to measure with all categories at that level, to compare the plans with.
         compose: The Gaussians of a plan; None: its levels as they are.
+        full: What fidelity is against; None: the last level.
         valid: The pixels of photos that count; views without any are left out.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
@@ -147,6 +149,7 @@ def evaluate(
     done, total = 0, len(views) * (1 + len(plans) + len(uniform))
     workspace = Workspace()
     last = ladder.load(ladder.levels[-1]).to(device_of(backend))
+    origin = last if full is None else full.to(device_of(backend))
     labels, kept, size = RenderedLabels(last, backend, antialiased), {}, 0
 
     def render(g: Gaussians, camera: Camera) -> np.ndarray:
@@ -163,13 +166,13 @@ def evaluate(
             view, photo = scene.views[row], as_unit(photos[row])
             neutral = view.camera.neutral  # fidelity is promised of pictures without a photo's exposure
             if row not in kept:
-                reference = render(last, neutral)
+                reference = render(origin, neutral)
                 size += reference.nbytes
                 if size <= KEPT:
                     kept[row] = reference
             else:
                 reference = kept[row]
-            image = reference if g is last else render(g, neutral)
+            image = reference if g is origin else render(g, neutral)
             least = PROMISED_SHARE * image.shape[0] * image.shape[1]
             fidelity = fidelity_by_label(image, reference, labels[view], least)
             colours = measure_colours(image, photo, valid[view])
@@ -186,7 +189,7 @@ def evaluate(
             if progress:
                 progress(done, total)
 
-    full = {row: measured for row, measured, _ in measure_all(last, others)}
+    of_last = {row: measured for row, measured, _ in measure_all(last, others)}
     for level in uniform:
         for row, measured, fidelity in measure_all(ladder.load(level), {}):
             rows.append({
@@ -195,7 +198,7 @@ def evaluate(
                 "predicted": np.nan, "fidelity": fidelity[TOTAL],
                 "ssim": measured[TOTAL]["ssim"], "psnr": measured[TOTAL]["psnr"],
                 "num_pixels": measured[TOTAL]["num_pixels"],
-                "full_ssim": full[row][TOTAL]["ssim"], "full_psnr": full[row][TOTAL]["psnr"],
+                "full_ssim": of_last[row][TOTAL]["ssim"], "full_psnr": of_last[row][TOTAL]["psnr"],
                 **_of_whole({}, {}),
             })  # fmt: skip
     for plan in plans:
@@ -209,8 +212,8 @@ def evaluate(
                     "predicted": predicted(plan.quality, label, level, row) if known else np.nan,
                     "fidelity": fidelity.get(label, np.nan),
                     "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
-                    "full_ssim": full[row][label]["ssim"], "full_psnr": full[row][label]["psnr"],
-                    **_of_whole(values, full[row][label]),
+                    "full_ssim": of_last[row][label]["ssim"], "full_psnr": of_last[row][label]["psnr"],
+                    **_of_whole(values, of_last[row][label]),
                 })  # fmt: skip
     return from_rows(Evaluation, rows)
 

@@ -2,6 +2,8 @@
 
 It needs no photo, so it can be measured at any number of viewpoints (`adapt.viewpoints`). The pixels of a
 category are those that its Gaussians paint in the full model. In the full model itself it is 1.
+
+The full model is the last level; of a splat that was adopted it is what came in, which the last level rounds.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -16,6 +18,7 @@ from sagesplat.adapt.ladder import Ladder, PrefixLadder
 from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
 from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.metrics.image import box_of, means_by_label, ssim_map, tiles_around
@@ -53,6 +56,7 @@ def measure_levels(
     cameras: Sequence[Camera],
     *,
     only: Collection[int] | None = None,
+    full: Gaussians | None = None,
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -63,6 +67,7 @@ def measure_levels(
         ladder: The levels.
         cameras: V viewpoints.
         only: Ids of the categories to measure, by rendering the parts of images that show them; None: all.
+        full: The full model, where it is not the last level.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (viewpoints measured, viewpoints in all).
@@ -71,7 +76,8 @@ def measure_levels(
         fidelity [V, L, K] of the labels in ascending order, NaN where one is not in sight or not measured;
         pixels [V, L]; fidelity of the whole image [V, K], NaN below the last level unless all are measured.
     """
-    references = References(ladder, backend, antialiased, keep=0, only=only)
+    references = References(ladder, backend, antialiased, keep=0, only=only, full=full)
+    measured = ladder.levels[:-1] if full is None else ladder.levels
     labels = references.labels
     found = np.full((len(cameras), len(labels), len(ladder.levels)), np.nan, np.float32)
     pixels = np.zeros(found.shape[:2], np.int32)
@@ -82,7 +88,7 @@ def measure_levels(
         at = references.at(camera)
         pixels[row] = at.pixels
         found[row, (pixels[row] > 0) & references.wanted, -1] = 1.0
-        for column, level in enumerate(ladder.levels[:-1]):
+        for column, level in enumerate(measured):
             of_level = dict.fromkeys(labels, level)
             found[row, :, column], whole[row, column] = references.compare(of_level, camera, at)
 
@@ -100,6 +106,7 @@ def measure_compositions(
     backend: Backend = "auto",
     antialiased: bool = False,
     only: Collection[int] | None = None,
+    full: Gaussians | None = None,
     progress: Callable[[int, int], None] | None = None,
     references: "References | None" = None,
 ) -> tuple[Float32[np.ndarray, "V J L+1"], Int32[np.ndarray, "V L"]]:
@@ -109,7 +116,7 @@ def measure_compositions(
     then come the pixels of each category. `references` are kept from call to call, and decide what is wanted.
     The other arguments are those of `measure_levels`.
     """
-    references = references or References(ladder, backend, antialiased, only=only)
+    references = references or References(ladder, backend, antialiased, only=only, full=full)
     labels = references.labels
     found = np.full((*planned.shape[:2], len(labels) + 1), np.nan, np.float32)
     pixels = np.zeros((len(cameras), len(labels)), np.int32)
@@ -159,14 +166,20 @@ class References:
         antialiased: bool,
         keep: int = _KEEP,
         only: Collection[int] | None = None,
+        full: Gaussians | None = None,
     ):
-        """`antialiased`: how the model was trained; `keep`: bytes; `only`: ids that are wanted, None: all."""
+        """`antialiased`: how the model was trained; `keep`: bytes; `only`: ids that are wanted, None: all.
+
+        `full`: the full model; None: the last level.
+        """
         self.labels = sorted({label for label, _ in ladder.counts})
         self.wanted = np.array([only is None or label in only for label in self.labels])
         self._ladder, self._antialiased, self._left = ladder, antialiased, keep
         self._backend: Backend = backend
-        full = ladder.load(ladder.levels[-1]).to(device_of(backend))
-        self._painted = RenderedLabels(full, backend, antialiased)
+        last = ladder.load(ladder.levels[-1]).to(device_of(backend))
+        self._labels = self._full = RenderedLabels(last, backend, antialiased)
+        if full is not None:
+            self._full = RenderedLabels(full.to(device_of(backend)), backend, antialiased)
         self._workspace, self._kept = Workspace(), {}
 
     def at(self, camera: Camera) -> Reference:
@@ -174,12 +187,12 @@ class References:
         key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
         if key in self._kept:
             return self._kept[key]
-        label_ids = self._painted.render(camera)
+        label_ids = self._labels.render(camera)
         pixels = np.array([(label_ids == label).sum() for label in self.labels], np.int32)
         tile_mask = None
         if not self.wanted.all():
             tile_mask = tiles_around(np.isin(label_ids, np.array(self.labels)[self.wanted]))
-        image = self._painted.paint(camera, tile_mask)
+        image = self._full.paint(camera, tile_mask)
         levels: Seen | None = None
         if isinstance(self._ladder, PrefixLadder):
             levels = seen_from(

@@ -108,8 +108,9 @@ def _fit(
 ) -> ViewModel:
     heldout = np.zeros(len(x), bool)
     mean = values.mean(0)
-    # the last level is the reference: known, and no part of the process (unless it is the only one)
-    learnt = slice(0, max(len(mean) - 1, 1))
+    # a last level that is the full model is known, and no part of the process (unless it is the only one)
+    known = bool((values[:, -1] == 1).all())
+    learnt = slice(0, max(len(mean) - known, 1))
     process = fit_process(x, heldout, (values - mean)[:, learnt])
     weights = np.zeros(values.shape)
     weights[:, learnt] = process.weights

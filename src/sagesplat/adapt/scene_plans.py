@@ -25,6 +25,7 @@ from sagesplat.adapt.fill import fill
 from sagesplat.adapt.plan import Choice, Plan, Reached, Status, check_share, check_target
 from sagesplat.adapt.viewpoint import QualityKind
 
+_ROUNDED = 1e-6  # by which means of ones differ from one
 LOWEST = 0.005  # fidelity by which the lowest category may lie below that of equal levels
 
 
@@ -48,7 +49,8 @@ def plan_for_scene(
         costs: What the levels cost; bytes to send are minimised.
         target: Above 0 and at most 1.
         share: Of the viewpoints that show the category, above 0 and at most 1.
-        kind: The quality that was measured. The highest level has fidelity 1, whatever the number of views.
+        kind: The quality that was measured. The highest level has fidelity 1, whatever the number of views;
+            not that of an adopted splat, which is compared with what came in.
         trained: [V], photos that training saw (`unseen_like`); None: none.
 
     Returns:
@@ -170,7 +172,8 @@ def _views(
     heldout, others = values[known & ~trained], values[known & trained]
     if kind == "fidelity":
         heldout = heldout.copy()
-        heldout[:, -1] = 1.0
+        if (heldout[:, -1] > 1 - _ROUNDED).all():  # the last level is the full model
+            heldout[:, -1] = 1.0
         return heldout, True
     enough = share < 1 and len(heldout) >= fewest_views(share)
     if enough or not len(others):

@@ -28,12 +28,14 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Float64
 from msgspec import Meta
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from sagesplat.adapt.free_poses import looking
 from sagesplat.core.errors import RunError
+from sagesplat.core.geometry import NO_OFFSET, Position
 from sagesplat.core.limits import Count, Positive, Screen, Seed, Share
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.typed import check_limits, convert_as, read_json_as, refused
@@ -75,6 +77,7 @@ class Viewpoints:
     focal: float  # of the base cameras, median, pixels
     cameras: tuple[Camera, ...]
     sets: tuple[str, ...]  # one of SETS for each
+    offset: Position = NO_OFFSET  # `Scene.offset`
 
     def rows(self, *names: str) -> np.ndarray:
         """Rows of the viewpoints in these sets, ascending."""
@@ -119,7 +122,7 @@ def draw(
             cameras.append(sampler.draw(rng))
             sets.append(name)
     focal = float(np.median([camera.focal for camera in base]))
-    return Viewpoints(rule, source, focal, tuple(cameras), tuple(sets))
+    return Viewpoints(rule, source, focal, tuple(cameras), tuple(sets), scene.offset)
 
 
 def check_rule(rule: Rule) -> None:
@@ -250,6 +253,7 @@ def write_viewpoints(path: Path, drawn: Viewpoints) -> None:
         for camera, name in zip(drawn.cameras, drawn.sets, strict=True)
     ]
     head = {"format": VIEWPOINTS, "version": 1, "rule": asdict(drawn.rule), "cameras": drawn.source}
+    head |= {"offset": drawn.offset} if any(drawn.offset) else {}
     write_json(path, {**head, "focal": drawn.focal, "viewpoints": entries})
 
 
@@ -269,15 +273,16 @@ def read_viewpoints(path: Path) -> Viewpoints:
         sets = tuple(entry.set for entry in made.viewpoints)
         if unknown := set(sets) - set(SETS):
             raise ValueError(f"unknown set {unknown.pop()!r}")
-    return Viewpoints(made.rule, made.cameras, made.focal, cameras, sets)
+    return Viewpoints(made.rule, made.cameras, made.focal, cameras, sets, made.offset)
 
 
-def read_cameras(path: Path, like: Camera) -> list[Camera]:
+def read_cameras(path: Path, like: Camera, offset: Position = NO_OFFSET) -> list[Camera]:
     """Base cameras from a file: a viewpoints.json, or the frames of a transforms.json (poses only).
 
     Args:
         path: The file. Frames need a `transform_matrix` (camera to world, OpenGL axes, the capture's world).
         like: Its intrinsics and image size are those of all frames.
+        offset: That was subtracted from all positions of the capture (`Scene.offset`).
 
     Returns:
         At least one camera.
@@ -289,10 +294,20 @@ def read_cameras(path: Path, like: Camera) -> list[Camera]:
     document = read_json(path, cure)
     with refused(path, "a list of viewpoints", cure):
         if isinstance(document, dict) and document.get("format") == VIEWPOINTS:
-            cameras = [entry.camera() for entry in convert_as(document, ViewpointsFile).viewpoints]
+            made = convert_as(document, ViewpointsFile)
+            by = np.subtract(offset, made.offset)
+            cameras = [replace(entry, w2c=_moved(entry.w2c, by)).camera() for entry in made.viewpoints]
         else:
-            poses = [frame.world_to_camera() for frame in convert_as(document, Poses).frames]
+            frames = convert_as(document, Poses).frames
+            poses = [_moved(frame.world_to_camera(), np.array(offset)) for frame in frames]
             cameras = [replace(like.neutral, w2c=w2c.astype(np.float32)) for w2c in poses]
         if not cameras:
             raise ValueError("no viewpoints")
     return cameras
+
+
+def _moved(w2c: Float64[np.ndarray, "4 4"], by: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "4 4"]:
+    """A pose, world to camera, after `by` was subtracted from all positions of the world."""
+    moved = w2c.copy()
+    moved[:3, 3] += w2c[:3, :3] @ by
+    return moved

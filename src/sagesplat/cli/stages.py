@@ -54,9 +54,13 @@ _FUSE = "Fuse the label images of all views through the trained Gaussians, befor
 def info(scene: Scene, scene_config: Annotated[SceneConfig, Flat] = SceneConfig()) -> None:
     """Print what a capture holds."""
     from sagesplat.scene import describe, load_scene
+    from sagesplat.segment.valid import describe_masks
 
     as_it_is = replace(scene_config, downscale=scene_config.downscale or 1)
-    rows = describe(load_scene(scene, **asdict(as_it_is)))
+    loaded = load_scene(scene, **asdict(as_it_is))
+    rows = describe(loaded)
+    if line := describe_masks(loaded):
+        rows.append(("pixels that count", line))
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         say(f"{name:{width}}  {value}")

@@ -28,6 +28,7 @@ def export(
     levels: tuple[StepNumber, ...] = (),
     rasterize_mode: Literal["classic", "antialiased"] | None = None,
     labels_inside: bool = False,
+    doubles: bool = False,
     ladder: Ladder = "nested",
     machine: Annotated[Compute, Flat] = Compute(),
 ) -> None:
@@ -52,6 +53,8 @@ def export(
             lod-meta.json, which say it; else classic, as most do)
         labels_inside: write the categories into the .ply, as a property and comments; viewers that rely on
             the published layout then fail
+        doubles: write x y z of a .ply as doubles in the capture's own coordinates, such as UTM; viewers that
+            rely on the published layout then fail
         chunks: write the increment of each level of each category as a file of this format
     """
     from sagesplat.segment.edit import parse_names
@@ -59,9 +62,10 @@ def export(
 
     if chunks and (only or without):
         raise RunError(f"{out}: --only and --without are for one scene; leave them out with --chunks")
-    if chunks and (rasterize_mode or labels_inside):
-        given = "--rasterize-mode" if rasterize_mode else "--labels-inside"
-        raise RunError(f"{out}: {given} is for one scene; leave it out with --chunks")
+    given = {"--rasterize-mode": rasterize_mode, "--labels-inside": labels_inside, "--doubles": doubles}
+    if chunks and any(given.values()):
+        one = next(name for name, value in given.items() if value)
+        raise RunError(f"{out}: {one} is for one scene; leave it out with --chunks")
     if target_fidelity is not None and target_ssim is not None:
         raise RunError(f"{out}: a scene has one target; leave out --target-ssim or --target-fidelity")
     with open_job(run, machine, ladder) as job:
@@ -73,7 +77,7 @@ def export(
             count = export_scene(
                 job, out, level=level, labels=parse_names(only, "only"), target=target, levels=levels,
                 rasterize_mode=rasterize_mode, without=parse_names(without, "without"),
-                labels_inside=labels_inside,
+                labels_inside=labels_inside, doubles=doubles,
             )  # fmt: skip
     say(f"{out}: {count:,} {'chunks' if chunks else 'Gaussians'}")
 

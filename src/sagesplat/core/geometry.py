@@ -1,8 +1,47 @@
-"""Geometry on plain arrays: projection, nearest neighbours, Morton order."""
+"""Geometry on plain arrays: offsets, projection, nearest neighbours, Morton order."""
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 from scipy.spatial import KDTree
+
+Position = tuple[float, float, float]  # world units
+NO_OFFSET: Position = (0.0, 0.0, 0.0)
+_FARTHEST = 1e9  # world units; float64 is too coarse beyond
+_LARGE = 1e5  # world units; float32 has steps of 0.01 there, too coarse for what is near a camera
+_FAR = 100.0  # times the size of a scene: from there, float32 costs 0.01 px and more in photos of 4000 px
+
+
+def offset_of(middles: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "M 3"] | None = None) -> Position:
+    """What to subtract, in float64, from all positions of a scene before float32 rounds them.
+
+    Zeros, unless the scene is far from its origin for its size, or farther than 10^5 units and its size, as
+    those in UTM are. Medians decide, so that a few outliers do not. The offset is a round number of about the
+    scene's size.
+
+    Args:
+        middles: Positions whose median is the middle of the scene: of its cameras, or of its Gaussians.
+        others: Positions that count for the size only: points.
+    """
+    middles = middles[np.isfinite(middles).all(axis=1)].astype(np.float64)
+    if not len(middles):
+        return NO_OFFSET
+    with np.errstate(all="ignore"):  # what overflows is not near enough to be moved
+        middle = np.median(middles, axis=0)
+        distance = float(np.linalg.norm(middle))
+        parts = [middles] if others is None or not len(others) else [middles, others]
+        size = max(float(np.median(np.linalg.norm(part - middle, axis=1))) for part in parts)
+    size = size if size > 1e-12 * distance else 1.0  # all in one place, as far as float64 tells
+    least = size if distance > _LARGE else _FAR * size
+    if not least < distance < _FARTHEST:
+        return NO_OFFSET
+    step = 10.0 ** np.floor(np.log10(size))
+    x, y, z = (np.round(middle / step) * step).tolist()
+    return x, y, z
+
+
+def offset_text(offset: Position) -> str:
+    """An offset for people and files: "412346 5312346 188"."""
+    return " ".join(f"{value:.10g}" for value in offset)
 
 
 def mean_neighbour_distance(xyz: Float32[np.ndarray, "P 3"], k: int = 3) -> Float32[np.ndarray, " P"]:

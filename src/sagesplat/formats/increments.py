@@ -23,7 +23,7 @@ from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import put_ply, read_ply
-from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, read_spz
+from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, position_step, read_spz
 from sagesplat.formats.stream import Decoded, decode_stream
 from sagesplat.io.files import atomic_folder, write_json
 from sagesplat.io.typed import read_json_as
@@ -103,7 +103,7 @@ def write_increments(
     `sizes`: by label id, the rows up to the end of each level. `names`: label id -> category. `replaces`: by
     label id, the levels that replace those below (`formats.levels.starts_of`). `kind`: of all files, or of a
     label id and level. `antialiased` as in `encode_spz`; the levels `fine` are rounded by the smallest steps
-    of the format.
+    of the format. Where SPZ's steps of positions are larger than most Gaussians, a file is a PLY.
 
     ValueError for levels that cannot replace.
     """
@@ -116,6 +116,8 @@ def write_increments(
         for label, level, rows in increments(g, sizes):
             part = g.select(torch.from_numpy(rows))
             suffix = kind_of(label, level)
+            if suffix == "spz" and np.greater(*position_step(part)):
+                suffix = "ply"  # some lie so far off that SPZ's steps are larger than the others
             temporary = fresh / f"increment.{suffix}"
             if suffix == "spz":
                 bits = _FINE_BITS if level in fine else SH_BITS

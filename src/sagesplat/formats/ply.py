@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int16
 from sagesplat import __version__
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.names import repaired
 from sagesplat.core.sh import BASES, C0
 from sagesplat.formats.labels import sidecar, with_labels, write_labels, write_or_remove_labels
@@ -24,6 +25,7 @@ from sagesplat.formats.splat import Splat, SplatReader, SplatWriter
 from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import PlyHeader, read_header, read_vertices
 
+_SOME = 2**16  # Gaussians that say how far from the origin doubles are
 ROWS = 4096  # Gaussians per block, so that a block fits into the processor's cache
 _DEGREE_4 = 24  # coefficients beyond the constant one; ours end with degree 3
 _FULL = {"f4": 1.0, "f8": 1.0, "u1": 255.0, "u2": 65535.0}  # largest value of a colour property, by type
@@ -144,6 +146,9 @@ def read_ply(path: Path | str) -> Gaussians:
     """
     path = Path(path)
     table = _read(path)
+    columns = table.columns
+    if any(table.offset):
+        columns[:3] += np.array(table.offset, np.float32)[:, None]
     _check_values(path, table)
     return with_labels(Splat(_gaussians(table), table.kind), path).gaussians
 
@@ -157,8 +162,10 @@ def read_ply_splat(path: Path) -> Splat:
     """
     table = _read(path)
     names, parents = (_names(table.comments, word) for word in ("label", "parent"))
-    antialiased = is_antialiased(table.comments)
-    return Splat(_gaussians(table), table.kind, names, antialiased, parents=parents, notes=tuple(table.notes))
+    return Splat(
+        _gaussians(table), table.kind, names, is_antialiased(table.comments), parents=parents,
+        notes=tuple(table.notes), offset=table.offset, up=vertical_axis(table.comments),
+    )  # fmt: skip
 
 
 def select_ply(source: Path, target: Path, keep: Bool[np.ndarray, " N"]) -> None:
@@ -214,6 +221,16 @@ def is_antialiased(comments: Iterable[str]) -> bool:
     return said
 
 
+def vertical_axis(comments: Iterable[str]) -> str:
+    """Which way is up, where nerfstudio wrote it into the header; else "auto".
+
+    Its exports are of a world whose z is up. Others, such as Brush, write `Vertical axis: y` for either sign.
+    """
+    words = [comment.lower() for comment in comments]
+    written = any("nerfstudio" in word or "nerstudio" in word for word in words)  # it misspells itself
+    return "z" if written and "vertical axis: z" in words else "auto"
+
+
 def _names(comments: Iterable[str], word: str) -> dict[int, str]:
     """Names by label id, as `write_ply` writes them behind a word."""
     names = {}
@@ -236,6 +253,7 @@ class _Table:
     names: list[str]  # in the order of `_properties`, without normals
     comments: tuple[str, ...]
     notes: list[str]  # as in Splat
+    offset: Position  # likewise
 
 
 def _read(path: Path) -> _Table:
@@ -245,7 +263,7 @@ def _read(path: Path) -> _Table:
             wanted = _wanted(path, header.types, notes)
             smoothing = [name for name in header.types if name.lower() in _FILTERS][:1]
             _note_others(header.types.keys() - {*wanted, *smoothing} - _PLAIN, notes)
-            columns, labels = _read_body(path, file, header, wanted + smoothing)
+            columns, labels, offset = _read_body(path, file, header, wanted + smoothing)
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); give a splat .ply") from None
     except (ValueError, OverflowError) as error:
@@ -261,7 +279,7 @@ def _read(path: Path) -> _Table:
         columns[3:6] = (columns[3:6] / full - 0.5) / C0
         notes.append("colours are red, green and blue: it has no f_dc")
     kind = "PLY" if header.order else "text PLY"
-    return _Table(kind, columns, labels, wanted, header.comments, notes)
+    return _Table(kind, columns, labels, wanted, header.comments, notes, offset)
 
 
 def _smoothed(
@@ -365,14 +383,17 @@ def _wanted(path: Path, types: Mapping[str, str], notes: list[str]) -> list[str]
 
 def _read_body(
     path: Path, file: BinaryIO, header: PlyHeader, wanted: list[str]
-) -> tuple[Float32[np.ndarray, "P N"], np.ndarray]:
-    """The wanted columns and the labels [N]."""
+) -> tuple[Float32[np.ndarray, "P N"], np.ndarray, Position]:
+    """The wanted columns, the labels [N], and what was subtracted from the first three."""
     count, labelled = header.count, "label" in header.types
     if not header.order:
         table = read_vertices(path, file, header)
+        offset = offset_of(np.stack([table[axis] for axis in "xyz"], axis=1)[:: count // _SOME + 1])
+        for axis, by in zip("xyz", offset, strict=True):
+            table[axis] = table[axis] - by
         with np.errstate(over="ignore"):
             columns = np.stack([table[name] for name in wanted]).astype(np.float32)
-        return columns, _whole(table["label"]) if labelled else np.full(count, -1, np.int64)
+        return columns, _whole(table["label"]) if labelled else np.full(count, -1, np.int64), offset
     present = (path.stat().st_size - file.tell()) // header.dtype.itemsize
     if present < count:
         raise DataError(
@@ -380,15 +401,21 @@ def _read_body(
             "again"
         )
     columns, labels = np.empty((len(wanted), count), np.float32), np.full(count, -1, np.int64)
+    offset, start = NO_OFFSET, file.tell()
+    if count and any(header.types[axis] == "f8" for axis in "xyz"):
+        some = np.memmap(file, header.dtype, "r", start, (count,))[:: count // _SOME + 1]
+        offset = offset_of(np.stack([some[axis] for axis in "xyz"], axis=1))
+        file.seek(start)
+    by = dict(zip("xyz", offset, strict=True)) if any(offset) else {}
     for start in range(0, count, ROWS):
         rows = slice(start, min(start + ROWS, count))
         block = np.fromfile(file, header.dtype, rows.stop - start)
         with np.errstate(over="ignore"):  # a double too large for float32 is then reported as infinite
             for column, name in zip(columns, wanted, strict=True):
-                column[rows] = block[name]
+                column[rows] = block[name] - by[name] if name in by else block[name]
         if labelled:
             labels[rows] = _whole(block["label"])
-    return columns, labels
+    return columns, labels, offset
 
 
 def _whole(labels: np.ndarray) -> np.ndarray:

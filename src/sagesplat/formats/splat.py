@@ -10,9 +10,11 @@ from torch import Tensor
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 
 # Axes in a file, left or right, up or down, front or back: SPZ's own are rub; COLMAP's and PLY's are rdf.
 Frame = Literal["rub", "ldb", "rdb", "lub", "ldf", "rdf", "luf", "ruf"]
+_SOME = 2**16  # Gaussians that say how far from the origin all are
 OPAQUE = 16.0  # logit of opacities that a file has as infinite; its sigmoid is 1 - 1e-7
 
 
@@ -28,6 +30,8 @@ class Splat:
     dropped: dict[str, int] = field(default_factory=dict)  # reason -> Gaussians that were left out
     parents: dict[int, str] = field(default_factory=dict)  # by label id of an instance: its category's name
     notes: tuple[str, ...] = ()  # what was not read as it is in the file, a line each, for people
+    offset: Position = NO_OFFSET  # that was subtracted from the positions in the file, world units
+    up: str = "auto"  # which way is up, such as "z", if the file says so
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,27 @@ def cleaned(splat: Splat, name: str) -> Splat:
     if not dropped and not opaque and splat.announced >= 0:
         return splat
     return replace(splat, gaussians=g, announced=announced, dropped=splat.dropped | dropped)
+
+
+def near_origin(splat: Splat) -> Splat:
+    """The splat with an offset subtracted from its positions where it is far from its origin.
+
+    A reader of doubles has subtracted one already, before they became float32.
+    """
+    means = splat.gaussians.means.numpy()
+    offset = offset_of(means[:: len(means) // _SOME + 1])
+    if any(splat.offset) or not any(offset):
+        return splat
+    return relative_to(splat, offset)
+
+
+def relative_to(splat: Splat, offset: Position) -> Splat:
+    """The splat with positions from which `offset` is subtracted, in place of its own."""
+    if offset == splat.offset:
+        return splat
+    by = torch.tensor(splat.offset, dtype=torch.float64) - torch.tensor(offset, dtype=torch.float64)
+    means = (splat.gaussians.means.double() + by).float()
+    return replace(splat, gaussians=replace(splat.gaussians, means=means), offset=offset)
 
 
 def check_writable(g: Gaussians, name: str) -> None:

@@ -8,10 +8,21 @@ from typing import BinaryIO
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import NO_OFFSET, Position
 from sagesplat.formats.archive import unpacked
 from sagesplat.formats.labels import with_labels
+from sagesplat.formats.offsets import with_offset, write_offset
 from sagesplat.formats.registry import READERS, WRITERS
-from sagesplat.formats.splat import Frame, ReadOptions, Splat, SplatReader, SplatWriter, WriteScene, cleaned
+from sagesplat.formats.splat import (
+    Frame,
+    ReadOptions,
+    Splat,
+    SplatReader,
+    SplatWriter,
+    WriteScene,
+    cleaned,
+    near_origin,
+)
 from sagesplat.io.files import loads_json
 
 __all__ = ["Splat", "num_lods", "read_splat", "scene_writer", "write_splat", "writer_of"]
@@ -31,7 +42,8 @@ def read_splat(path: Path | str, lod: int = 0, *, spz_axes: Frame = "rub") -> Sp
             PlayCanvas's tools write those of PLY, "rdf".
 
     Returns:
-        Gaussians in COLMAP's axes as INRIA's PLY has them, with what was left out by reason.
+        Gaussians in COLMAP's axes as INRIA's PLY has them, with what was left out by reason. Where they are
+        far from the origin an offset was subtracted from their positions: `Splat.offset`.
 
     Raises:
         DataError: If there is no such file or level, its format is not known, or it is damaged; or if no
@@ -58,10 +70,11 @@ def read_splat(path: Path | str, lod: int = 0, *, spz_axes: Frame = "rub") -> Sp
         if lod and reader.num_lods is None:
             raise DataError(f"{file}: {kind} has one level; read level 0")
         splat = reader.read(file, ReadOptions(lod=lod, spz_axes=spz_axes))
-        splat = cleaned(with_labels(splat, file), str(file))
+        splat = cleaned(with_offset(with_labels(splat, file), file), str(file))
         if inside != path:
             splat = with_labels(replace(splat, kind=f"{splat.kind} in a ZIP"), path)
-    return splat
+            splat = with_offset(splat, path)
+    return near_origin(splat)
 
 
 def num_lods(path: Path) -> int:
@@ -130,13 +143,16 @@ def write_splat(
     *,
     parents: Mapping[int, str] | None = None,
     antialiased: bool = False,
+    offset: Position = NO_OFFSET,
 ) -> None:
     """Write Gaussians in the format that the suffix says (`registry.WRITERS`), with their labels and `names`.
 
-    `parents` are the names of the categories that instances are of, by label id. `read_splat` finds all of it
-    again. DataError for another suffix, one of a format of several levels, and what the formats cannot hold.
+    `parents` are the names of the categories that instances are of, by label id; `offset` is to be added to
+    all positions, and is written beside the file. `read_splat` finds all of it again. DataError for another
+    suffix, one of a format of several levels, and what the formats cannot hold.
     """
     scene_writer(path)(path, g, names or {}, parents or {}, antialiased)
+    write_offset(path, offset)
 
 
 def scene_writer(path: Path) -> WriteScene:

@@ -78,10 +78,20 @@ def write_spz(
 ) -> int:
     """Write an SPZ file atomically. Arguments and errors are those of `encode_spz`, which has more.
 
+    DataError, too, where some Gaussians lie so far off that positions are rounded to more than the size of
+    the others.
+
     Returns:
         The size of the file in bytes.
     """
     path = Path(path)
+    check_writable(g, str(path))
+    step, size = position_step(g)
+    if step > size:
+        raise DataError(
+            f"{path}: positions reach {float(g.means.abs().max()):.3g}, so SPZ would round them to "
+            f"{step:.2g}, more than the size of most Gaussians ({size:.2g}); write a .ply"
+        )
     content = encode_spz(
         g, antialiased=antialiased, frame=frame, version=version, names=names, parents=parents, name=str(path)
     )
@@ -165,6 +175,15 @@ def encode_spz(
     if frame != "rub":
         records[_AXES] = _FRAMES.index(frame, 1).to_bytes(4, "little")
     return zstd_packed(len(g), g.sh_degree, bits, flags, attributes, records)
+
+
+def position_step(g: Gaussians) -> tuple[float, float]:
+    """The finest step that SPZ has for these positions, and the size of nine in ten Gaussians or more."""
+    if not len(g):
+        return 0.0, 0.0
+    extent = max(float(g.means.abs().max()), 2.0**-MAX_BITS)
+    size = 2.0 ** -_enough_bits(g.log_scales.detach().cpu().numpy(), 1, least=-MAX_BITS)
+    return 2.0 ** -min(int(np.floor(np.log2(_LARGEST / extent))), MAX_BITS), size
 
 
 def packing_order(g: Gaussians) -> Int64[np.ndarray, " N"]:
@@ -275,12 +294,12 @@ def _fractional_bits(
     return wanted
 
 
-def _enough_bits(log_scales: np.ndarray, parts: int) -> int:
-    """Fractional bits of a step of 1/`parts` of the middle axis of 90 % of the Gaussians; at least 1."""
+def _enough_bits(log_scales: np.ndarray, parts: int, least: int = 1) -> int:
+    """Fractional bits of a step of 1/`parts` of the middle axis of 90 % of the Gaussians; `least` or more."""
     if not len(log_scales):
         return 1
     small = float(np.quantile(np.sort(log_scales.astype(np.float64), axis=1)[:, 1], 0.1))
-    return max(1, int(np.ceil(np.log2(parts) - small / np.log(2))))
+    return max(least, int(np.ceil(np.log2(parts) - small / np.log(2))))
 
 
 def flipped(

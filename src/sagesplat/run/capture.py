@@ -4,12 +4,13 @@ import hashlib
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from sagesplat.core.config import SceneConfig
 from sagesplat.core.errors import RunError, short
+from sagesplat.core.geometry import NO_OFFSET, Position
 from sagesplat.io.files import write_json
 from sagesplat.io.typed import convert_as, known_json, read_json_as
 from sagesplat.run.records import file_hash
@@ -29,6 +30,7 @@ class Capture:
     fingerprint: str
     photos: dict[str, str]  # SHA-256 by name
     vignetting: Vignetting | None = None  # that was found in the photos, where it was looked for
+    offset: Position = NO_OFFSET  # of an adopted splat that was far from its origin (`Scene.offset`)
 
     def __post_init__(self) -> None:
         convert_as(self.settings, SceneConfig)
@@ -39,6 +41,7 @@ class Capture:
         """The capture, whose vignetting is not estimated again. Raises SceneError."""
         settings: dict[str, Any] = {**self.settings, "vignetting": False}
         scene = load_scene(self.path, **settings)
+        scene = scene if any(scene.offset) else replace(scene, offset=self.offset)
         return with_vignetting(scene, self.vignetting) if self.vignetting else scene
 
 
@@ -59,6 +62,8 @@ def fingerprint(scene: Scene) -> str:
         if view.vignetting:
             digest.update(repr(view.vignetting).encode())
     digest.update(scene.points.xyz.tobytes())
+    if any(scene.offset):
+        digest.update(repr(scene.offset).encode())
     if scene.test_names is not None:
         digest.update("\n".join(sorted(scene.test_names)).encode())
     if scene.calibration_names is not None:

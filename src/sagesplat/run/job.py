@@ -246,6 +246,11 @@ class Job:
         """The Gaussians that training ended with, floaters included."""
         return self.recorded.load(self.last_level.step)
 
+    @cached_property
+    def came_in(self) -> Gaussians | None:
+        """The splat that was adopted, which fidelity is against; None where the run trained its own."""
+        return self.load_last_level() if self.run.adopted.exists() else None
+
     @property
     def trained(self) -> Path:
         """The trained model: the last level, without its floaters where some were removed."""
@@ -263,7 +268,7 @@ class Job:
     @cached_property
     def references(self) -> References:
         """What compositions of the ladder's levels are compared with."""
-        return References(self.ladder, self.backend, self.antialiased)
+        return References(self.ladder, self.backend, self.antialiased, full=self.came_in)
 
     def check_named(self, path: Path, label_ids: Iterable[int]) -> None:
         """RunError for an id that the run's labels.json does not name."""

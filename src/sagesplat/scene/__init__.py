@@ -7,7 +7,10 @@ from typing import Literal
 import numpy as np
 
 from sagesplat.core.errors import SceneError
+from sagesplat.core.geometry import offset_text
+from sagesplat.io.colour_profile import describe_profiles
 from sagesplat.scene.detect import CAPTURES, detect
+from sagesplat.scene.given_masks import GivenMasks
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import read_scene
@@ -22,9 +25,9 @@ def load_scene(
 ) -> Scene:  # fmt: skip
     """Load a capture: posed photos and structure-from-motion points.
 
-    The format is detected: a COLMAP workspace, nerfstudio's transforms.json, a Blender scene, or a scene that
-    sagesplat stored. Photos and videos without poses are not captures: `photos.reconstruct` makes one of
-    them.
+    The format is detected: a COLMAP workspace, nerfstudio's transforms.json, a Blender scene, the folders of
+    Polycam (raw data) and Record3D, cameras of Metashape in XML, or a scene that sagesplat stored. Photos and
+    videos without poses are not captures: `photos.reconstruct` makes one of them.
 
     Args:
         path: Folder of the capture, or its transforms.json.
@@ -77,6 +80,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
         ("name", scene.name),
         ("path", str(scene.path)),
         ("views", f"{len(views)} ({splits})"),
+        *(("read", note) for note in scene.notes),
         ("image size", ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")),
         ("cameras", f"{len(Ks)} distinct intrinsics"),
         (
@@ -91,6 +95,8 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
         ("points", f"{len(points.xyz):,}" + ("" if len(points.track_points) else ", without tracks")),
         ("extent", f"{scene.extent:.3g} world units"),
     ]
+    if any(scene.offset):
+        rows.append(("offset", f"{offset_text(scene.offset)}, subtracted from all positions"))
     if len(points.track_points):
         depth, error = _depth_and_error(scene)
         length = len(depth) / len(np.unique(points.track_points))
@@ -100,9 +106,15 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
             ("reprojection error", f"{np.median(error):.2f} px median"),
             ("depth of points", f"{near:.3g} nearest, {middle:.3g} median, {far:.3g} farthest"),
         ]
+    rows += [("colours", line) for line in describe_profiles(view.image_path for view in views)]
     masks = scene.path / "masks"
     num_masks = len(list(masks.glob("**/*.png")))
-    rows.append(("masks", f"{num_masks} label images in {masks.name}/" if num_masks else "no masks/ folder"))
+    photos = scene.views[0].image_path.parents[scene.views[0].name.count("/")]
+    given = GivenMasks([scene.path, photos.parent], photos)
+    if num_masks and masks not in given.folders:
+        rows.append(("masks", f"{num_masks} label images in {masks.name}/"))
+    elif not given:
+        rows.append(("masks", "no masks/ folder"))
     return rows
 
 

@@ -11,10 +11,12 @@ from typing import Any
 from PIL import Image, ImageOps
 
 from sagesplat.core.names import cleaned, clipped, collision_key
+from sagesplat.io.colour_profile import profile_of
 from sagesplat.io.files import atomic_path, link
 from sagesplat.io.pictures import PictureError, open_picture
-from sagesplat.scene.detect import PHOTOS, VALID_FOLDER
+from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.exif import DETAILS, exif_of
+from sagesplat.scene.given_masks import holds_masks, is_mask_among, mask_folders
 from sagesplat.scene.images import as_rgb
 
 _LONGEST, _ROOM = 250, 30  # bytes of a name, and what is left of them for suffixes
@@ -73,17 +75,29 @@ def prepare_photos(
 
 def _list(source: Path, skipped: Path) -> list[Path]:
     """Photos below a folder, without hidden ones and masks, sorted by name with numbers by value."""
-    skipped, masks = skipped.resolve(), source / VALID_FOLDER
+    skipped, masks = (
+        skipped.resolve(),
+        [folder for folder in mask_folders(source) if _holds_no_photos(folder)],
+    )
     outside = not source.resolve().is_relative_to(skipped)
     photos = []
     for path in source.rglob("*"):
         hidden = any(part.startswith(".") for part in path.relative_to(source).parts)
-        hidden |= path.is_relative_to(masks)
+        hidden |= any(path.is_relative_to(folder) for folder in masks)
         if path.suffix.lower() not in PHOTOS or hidden or not path.is_file():
             continue
         if not (outside and path.resolve().is_relative_to(skipped)):
             photos.append(path)
+    names: dict[Path, set[str]] = {}
+    for path in photos:
+        names.setdefault(path.parent, set()).add(path.name.lower())
+    photos = [path for path in photos if not is_mask_among(path, frozenset(names[path.parent]))]
     return sorted(photos, key=_by_number)
+
+
+def _holds_no_photos(folder: Path) -> bool:
+    """Whether a folder of a name for masks holds masks, or label images."""
+    return (folder / "labels.json").exists() or holds_masks(folder)
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:
@@ -152,7 +166,9 @@ def _is_prepared(target: Path, size: tuple[int, ...], mtime_ns: int) -> bool:
 def _changed(path: Path, image: Image.Image, exif: Image.Exif) -> Image.Image | None:
     """The photo as upright 8-bit RGB, or None if the file is that already; decodes it in both cases."""
     turned = _orientation(exif) > 1
+    content = image.info.get("icc_profile")
     as_is = image.format in ("JPEG", "MPO", "PNG") and image.mode == "RGB" and not turned
+    as_is = as_is and not (content and profile_of(content).kind == "other")
     if as_is and image.format == "PNG":
         with path.open("rb") as file:
             as_is = file.read(25)[24] == 8 and not image.has_transparency_data  # Pillow reads 16 bits as 8

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from msgspec import Meta
 
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.names import repaired
 from sagesplat.io.files import read_json
 from sagesplat.io.typed import convert_as, refused
@@ -34,6 +35,7 @@ class NamedCamera:
     name: str  # for people: printable, not necessarily unique
     camera: Camera
     photo: View | None = None  # `scene.images` reads it
+    offset: Position = NO_OFFSET  # that was subtracted from its position in the file; of all in it the same
 
 
 def read_camera_file(path: Path) -> list[NamedCamera]:
@@ -61,25 +63,30 @@ def read_camera_file(path: Path) -> list[NamedCamera]:
     with refused(path, "a list of cameras", _CURE):
         if isinstance(document, list):
             entries = convert_as(document, list[_Of3dgs])
-            found = [_of_3dgs(entry, number) for number, entry in enumerate(entries)]
+            offset = offset_of(np.array([entry.position for entry in entries]).reshape(-1, 3))
+            found = [_of_3dgs(entry, number, offset) for number, entry in enumerate(entries)]
         else:
-            cameras = convert_as(document, ViewpointsFile).viewpoints
-            found = [NamedCamera(f"{number:03}", entry.camera()) for number, entry in enumerate(cameras)]
+            made = convert_as(document, ViewpointsFile)
+            found = [
+                NamedCamera(f"{number:03}", entry.camera(), offset=made.offset)
+                for number, entry in enumerate(made.viewpoints)
+            ]
         if not found:
             raise ValueError("no cameras")
     return found
 
 
 def _of_capture(path: Path) -> list[NamedCamera]:
-    return [NamedCamera(repaired(v.name), v.camera, v) for v in load_scene(path, test_every=0).views]
+    scene = load_scene(path, test_every=0)
+    return [NamedCamera(repaired(view.name), view.camera, view, scene.offset) for view in scene.views]
 
 
 def _of_transforms(path: Path) -> list[NamedCamera]:
     """Of a transforms.json: with its photos if they are there."""
-    cameras, complete = frame_cameras(path)
+    cameras, complete, offset = frame_cameras(path)
     if complete:
         return _of_capture(path)
-    return [NamedCamera(repaired(name), _within_limits(camera)) for name, camera in cameras]
+    return [NamedCamera(repaired(name), _within_limits(camera), offset=offset) for name, camera in cameras]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,15 +124,16 @@ class ViewpointsFile:
 
     format: Viewpoints
     viewpoints: list[CameraEntry]
+    offset: Position = NO_OFFSET  # `Scene.offset`
 
 
-def _of_3dgs(entry: _Of3dgs, number: int) -> NamedCamera:
+def _of_3dgs(entry: _Of3dgs, number: int, offset: Position) -> NamedCamera:
     w2c = np.eye(4)
-    w2c[:3, :3], w2c[:3, 3] = entry.rotation.T, -entry.rotation.T @ entry.position
+    w2c[:3, :3], w2c[:3, 3] = entry.rotation.T, -entry.rotation.T @ (entry.position - np.array(offset))
     K = np.array([[entry.fx, 0, entry.width / 2], [0, entry.fy, entry.height / 2], [0, 0, 1]])
     given = entry.img_name
     name = repaired(given) if isinstance(given, str) and given else f"{number:03}"
-    return NamedCamera(name, _camera(w2c, K, entry.width, entry.height))
+    return NamedCamera(name, _camera(w2c, K, entry.width, entry.height), offset=offset)
 
 
 def _within_limits(camera: Camera) -> Camera:

@@ -2,11 +2,13 @@
 
 import os.path
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from sagesplat.core.errors import SceneError, short
+from sagesplat.core.geometry import Position, offset_of
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
@@ -36,11 +38,25 @@ def load_colmap(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene
             raise SceneError(f"{model}: no 3D points; run COLMAP's mapper or point_triangulator again")
         _check_names(model, listed)
         listed = sorted(listed, key=lambda image: image.name)
+        offset, listed, points = _near_origin(listed, points)
         folder, divisor = _find_photos(path, downscale)
         _check_photos(folder, listed)
         views = _views(model, folder, cameras, listed, divisor)
         tracked = _scene_points(cameras, listed, views, points)
-    return Scene(repaired(path.resolve().name), path, views, tracked, test_every)
+    return Scene(repaired(path.resolve().name), path, views, tracked, test_every, offset=offset)
+
+
+def _near_origin(
+    listed: list[ModelImage], points: ModelPoints
+) -> tuple[Position, list[ModelImage], ModelPoints]:
+    """The model with an offset subtracted from all positions, where it is far from its origin."""
+    w2c = np.stack([image.w2c for image in listed])
+    offset = offset_of(-np.einsum("vji,vj->vi", w2c[:, :3, :3], w2c[:, :3, 3]), points.xyz)
+    if not any(offset):
+        return offset, listed, points
+    w2c[:, :3, 3] += w2c[:, :3, :3] @ offset
+    listed = [replace(image, w2c=moved) for image, moved in zip(listed, w2c, strict=True)]
+    return offset, listed, points._replace(xyz=points.xyz - offset)
 
 
 def _find_model(path: Path) -> Path:

@@ -9,11 +9,18 @@ from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
 from sagesplat.scene.colmap import MODEL_FILES, load_colmap
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
+from sagesplat.scene.scans import (
+    is_metashape,
+    is_polycam,
+    is_record3d,
+    load_metashape,
+    load_polycam,
+    load_record3d,
+)
 from sagesplat.scene.scene import Scene
 
 # Their content decides how they are read (`io.pictures`).
 PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
-VALID_FOLDER = "masks_valid"  # beside photos: masks named like them, black where pixels do not count
 VIDEOS = frozenset(
     {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp"}
 )
@@ -26,12 +33,16 @@ class CaptureFormat:
     files: tuple[str, ...]  # in the capture's folder: one of them is there
     load: Callable[..., Scene]  # (path, downscale=, test_every=) -> the scene
     suffix: str | None = None  # of other files that stand for a capture
+    holds: Callable[[Path], bool] = lambda folder: False  # or this says that the folder is one
 
 
 CAPTURES = {
     "colmap": CaptureFormat(MODEL_FILES, load_colmap),
     "transforms": CaptureFormat(("transforms.json",), load_transforms, suffix=".json"),
     "blender": CaptureFormat(("transforms_train.json",), load_blender),
+    "polycam": CaptureFormat((), load_polycam, holds=is_polycam),
+    "record3d": CaptureFormat((), load_record3d, holds=is_record3d),
+    "metashape": CaptureFormat((), load_metashape, suffix=".xml", holds=is_metashape),
 }
 
 
@@ -50,13 +61,14 @@ def detect(path: Path) -> str:
     if not os.path.isdir(path):
         raise SceneError(f"{path}: no such file or folder; give a capture's folder or a video")
     for kind, capture in CAPTURES.items():
-        if any((path / name).is_file() for name in capture.files):
+        if any((path / name).is_file() for name in capture.files) or capture.holds(path):
             return kind
     if any(_holds_photos(folder) for folder in (path / "images", path)):
         return "photos"
     looked_for = ", ".join(name for capture in CAPTURES.values() for name in capture.files)
     raise SceneError(
-        f"{path}: no capture (looked for {looked_for}, and photos in images/ and the folder); "
+        f"{path}: no capture (looked for {looked_for}, Polycam's and Record3D's, cameras of Metashape, "
+        "and photos in images/ and the folder); "
         "give a folder that has one of them, or a video file"
     )
 
@@ -71,7 +83,10 @@ def _of_file(path: Path) -> str:
         return "stored"
     if suffix in VIDEOS:
         return "video"
-    raise SceneError(f"{path}: neither a transforms .json nor a video; give a folder, or one of these files")
+    raise SceneError(
+        f"{path}: neither a transforms .json, an .xml of Metashape nor a video; give one of these, or a "
+        "folder (unpack archives)"
+    )
 
 
 def _holds_photos(folder: Path) -> bool:

@@ -12,8 +12,8 @@ from PIL import Image
 from sagesplat.core.errors import SceneError
 from sagesplat.io.files import atomic_path
 from sagesplat.scene._prepare import PreparedPhoto
-from sagesplat.scene.detect import VALID_FOLDER
-from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
+from sagesplat.scene.given_masks import VALID_FOLDER, GivenMasks, mask_of_photo
+from sagesplat.scene.images import cut_out, has_alpha, load_alpha
 from sagesplat.scene.raw_photos import same_aspect, upright
 
 Pixels = Bool[np.ndarray, "H W"]
@@ -25,7 +25,7 @@ def write_feature_masks(
 ) -> dict[str, str]:
     """Write the masks of photos that have some, as COLMAP reads them.
 
-    Those that come with the photos (`masks_valid/` below `source`, alpha) go to `masks_valid/` of the capture
+    Those that come with the photos (`given_masks` below `source`, alpha) go to `masks_valid/` of the capture
     too, whose photos have lost them.
 
     Args:
@@ -45,8 +45,10 @@ def write_feature_masks(
     cut = bool(transparent) and cut_out([source / photo.path for photo in transparent])
     opaque_only = set(transparent) if alpha == "ignore" or (alpha == "auto" and not cut) else set()
     masks: dict[str, str] = {}
+    given_masks = GivenMasks([source, source / "images"], source)
     for photo in photos:
-        given = [_of_folder(photo, source / VALID_FOLDER)]
+        found = mask_of_photo(given_masks, photo.path)
+        given = [None if found is None else found.read(photo.size[0] * photo.size[1])]
         if photo in opaque_only:
             given.append(upright(load_alpha(source / photo.path) == 255, photo.orientation))
         if (valid := _all_of(photo, given)) is not None:
@@ -59,17 +61,6 @@ def write_feature_masks(
         if photo.prepared not in masks:
             _write(target / f"{photo.prepared}.png", np.ones(photo.size[::-1], bool))
     return masks
-
-
-def _of_folder(photo: PreparedPhoto, folder: Path) -> Pixels | None:
-    """The mask of a photo in `masks_valid/`."""
-    name = Path(photo.path)
-    names = [name, *([name.relative_to("images")] if name.parts[0] == "images" else [])]
-    paths = (folder / other for of in names for other in (f"{of.as_posix()}.png", of.with_suffix(".png")))
-    path = next((path for path in paths if path.is_file()), None)
-    if path is None:
-        return None
-    return read_black(path, photo.size[0] * photo.size[1])
 
 
 def _upright(mask: Bool[np.ndarray, "h w"], photo: PreparedPhoto) -> Pixels:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from sagesplat.core.errors import SceneError
+from sagesplat.io.colour_profile import in_srgb
 from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.scene.scene import View
 from sagesplat.scene.undistort import undistort
@@ -61,15 +62,23 @@ def _clear_border(alpha: UInt8[np.ndarray, "h w"]) -> float:
 
 
 def read_black(path: Path, pixels: int) -> Bool[np.ndarray, "h w"]:
-    """Where a PNG of any mode is not black; `pixels`: of its photo. SceneError for what is no image."""
+    """Where a mask of any mode is not black; `pixels`: of its photo. SceneError for what is no image.
+
+    In formats that compress with loss what is darker than the middle is black. So is what is transparent.
+    """
     try:
-        with open_picture(path, ("PNG",), free=max(FREE_PIXELS, 4 * pixels)) as image:
-            coloured = image.convert("RGB") if image.mode in ("P", "PA", "RGBA") else image
+        with open_picture(path, free=max(FREE_PIXELS, 4 * pixels)) as image:
+            least = 0 if image.format in ("PNG", "TIFF", "BMP") else 127
+            clear = None
+            if image.has_transparency_data and not image.mode.startswith("I"):
+                clear = np.asarray(image.convert("RGBA").getchannel("A")) < 128
+            coloured = image.convert("RGB") if image.mode not in ("1", "L", "LA", "I", "I;16") else image
             values = np.asarray(coloured.getchannel(0) if coloured.mode == "LA" else coloured)
     except PictureError as error:
         cure = error.cure or "export it again"
-        raise SceneError(f"{path}: not a readable PNG ({error.reason}); {cure}") from None
-    return np.array(values.any(2) if values.ndim == 3 else values, bool)
+        raise SceneError(f"{path}: not a readable mask ({error.reason}); {cure}") from None
+    counts = np.array((values > least).any(2) if values.ndim == 3 else values > least, bool)
+    return counts if clear is None else counts & ~clear
 
 
 def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
@@ -183,13 +192,14 @@ def _version(path: Path) -> tuple[int, int] | None:
 
 
 def as_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
-    """The image, of any Pillow mode, as 8-bit RGB; alpha is composited over `background`.
+    """The image, of any Pillow mode, as 8-bit sRGB; alpha is composited over `background`.
 
     Decodes it. Returns `image` itself where it is RGB already.
     """
     image.load()
     if image.mode.startswith("I") or image.mode == "F":
         return _grey(image).convert("RGB")
+    image = in_srgb(image)
     if image.has_transparency_data:
         return _composited(image, background)
     return image if image.mode == "RGB" else image.convert("RGB")

@@ -17,6 +17,7 @@ from jaxtyping import Float64
 from msgspec import Meta
 
 from sagesplat.core.errors import SceneError, short
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import read_json
 from sagesplat.io.typed import convert_as, refused
@@ -92,7 +93,9 @@ class _Transforms:
     val_filenames: list[str] | None = None
 
 
-def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+def load_transforms(
+    path: Path, *, downscale: int = 1, test_every: int = 8, content: dict[str, Any] | None = None
+) -> Scene:
     """The scene of nerfstudio's or instant-ngp's transforms.json; `path` is the file or its folder.
 
     With `downscale` N the photos are read from `images_N/` if the frames are in images/ and that folder
@@ -100,22 +103,49 @@ def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> S
     the split unless `test_every` is 0: `val` is used only without `test`, and unlisted frames are dropped.
     Points are read from `ply_file_path`, else made by `points.random_points`. They are in the frame of the
     poses: `applied_transform` has been applied to both. A frame's `mask_path` says which pixels count (not
-    black). Depths are not read. Raises SceneError.
+    black). Depths are not read. `content`: of a file of another format, in place of what `path` holds. Raises
+    SceneError.
     """
-    file = path if path.suffix == ".json" else path / "transforms.json"
+    file = path if path.suffix == ".json" or content else path / "transforms.json"
     check_settings(path, downscale, test_every)
-    content, frames = _read(file)
+    transforms, frames = _read(file, content)
+    offset, points = offset_of(_positions(frames)), None
+    if transforms.ply_file_path is not None:
+        ply = file.parent / _inside(file, "ply_file_path", transforms.ply_file_path)
+        points = read_points(ply, offset)
+        if any(offset) and not any(offset_of(_positions(frames), points.xyz + np.array(offset))):
+            offset, points = NO_OFFSET, read_points(ply)  # cameras that hardly moved, in a wide scene
+    frames = _moved(frames, offset)
     views = _views(file, frames, downscale)
     test_names = None
     if test_every:
-        views, test_names = _listed_split(file, content, frames, views)
+        views, test_names = _listed_split(file, transforms, frames, views)
     views = _sorted(file, views, test_names)
-    if content.ply_file_path is None:
-        points = random_points(views)
-    else:
-        points = read_points(file.parent / _inside(file, "ply_file_path", content.ply_file_path))
+    points = random_points(views) if points is None else points
     folder = file.parent
-    return Scene(repaired(folder.resolve().name), folder, views, points, test_every, test_names=test_names)
+    name = repaired(folder.resolve().name)
+    return Scene(name, folder, views, points, test_every, test_names=test_names, offset=offset)
+
+
+def _positions(frames: Sequence[Pose]) -> Float64[np.ndarray, "V 3"]:
+    """Camera centres; frames without a pose, which are an error later, have none."""
+    poses = [frame.transform_matrix for frame in frames]
+    usable = [pose[:3, 3] for pose in poses if pose is not None and pose.shape in ((3, 4), (4, 4))]
+    return np.array(usable, np.float64).reshape(-1, 3)
+
+
+def _moved(frames: list[_Frame], offset: Position) -> list[_Frame]:
+    """The frames with an offset subtracted from their positions."""
+    if not any(offset):
+        return frames
+    moved = []
+    for frame in frames:
+        if frame.transform_matrix is not None:
+            matrix = frame.transform_matrix.copy()
+            matrix[:3, 3:] -= np.array(offset)[: len(matrix[:3]), None]
+            frame = replace(frame, transform_matrix=matrix)
+        moved.append(frame)
+    return moved
 
 
 def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
@@ -142,13 +172,15 @@ def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scen
     return Scene(name, folder, views, points, test_every, test_names=test_names, alpha="background")
 
 
-def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
-    """Name and camera of each frame of a transforms file, and whether all of their photos are there.
+def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool, Position]:
+    """Name and camera of each frame of a transforms file, whether all photos are there, and their offset.
 
     Lenses are replaced by pinholes. Without a photo, a frame (or the file) has to give its size, w and h.
     Raises SceneError.
     """
     _, frames = _read(file)
+    offset = offset_of(_positions(frames))
+    frames = _moved(frames, offset)
     found, photos = [], []
     for number, frame in enumerate(frames):
         name = frame.file_path or f"{number:03}"
@@ -164,12 +196,12 @@ def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
             cure = "export the transforms again"
             raise SceneError(f"{file}: frame {short(repr(name))}: {short(error)}; {cure}") from None
         found.append((name, Camera(w2c, K, lens.width, lens.height)))
-    return found, None not in photos
+    return found, None not in photos, offset
 
 
-def _read(file: Path) -> tuple[_Transforms, list[_Frame]]:
+def _read(file: Path, content: dict[str, Any] | None = None) -> tuple[_Transforms, list[_Frame]]:
     """The content of a transforms file, and its frames with the file's shared values filled in."""
-    content = read_json(file, _CURE, SceneError)
+    content = read_json(file, _CURE, SceneError) if content is None else content
     cure = 'export the transforms again, with {"frames": [...]} in them'
     with refused(file, "a transforms file", cure, SceneError):
         transforms = convert_as(content, _Transforms)

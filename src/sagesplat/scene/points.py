@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from sagesplat.core import geometry
 from sagesplat.core.errors import SceneError, short
+from sagesplat.core.geometry import Position
 from sagesplat.io.ply_header import read_header, read_vertices
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.scene import Points, View
@@ -26,11 +27,11 @@ def untracked(xyz: Float32[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"]) ->
     return Points(xyz, rgb, np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros((0, 2), np.float32))
 
 
-def read_points(path: Path) -> Points:
+def read_points(path: Path, offset: Position = geometry.NO_OFFSET) -> Points:
     """The vertices of a PLY file, ASCII or binary of either byte order: x y z, and red green blue or grey.
 
     Colours are whole numbers up to 255 (65535 in 16 bits), or floats up to 1. Points without colours
-    are grey. Raises SceneError.
+    are grey. `offset` is subtracted from the positions before they become float32. Raises SceneError.
     """
     try:
         with path.open("rb") as file:
@@ -47,7 +48,7 @@ def read_points(path: Path) -> Points:
             f"{path}: not readable as a PLY file ({short(error)}); export the points again"
         ) from None
     with np.errstate(over="ignore"):  # a double too large for float32 is then reported
-        xyz = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float32)
+        xyz = (np.stack([table[axis] for axis in "xyz"], axis=1) - np.array(offset)).astype(np.float32)
         if bad := int(np.count_nonzero(~np.isfinite(xyz).all(axis=1))):
             raise SceneError(f"{path}: {bad} of {len(xyz)} points are not finite; export the points again")
         rgb = np.full((len(xyz), 3), GREY, np.uint8)

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt8
 from msgspec import Meta
 
+from sagesplat.core.geometry import NO_OFFSET, Position
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -121,6 +123,8 @@ class Scene:
     test_names: frozenset[str] | None = None  # overrides test_every: test views that the data set lists
     calibration_names: frozenset[str] | None = None  # likewise overrides calibrate_every
     alpha: Literal["auto", "background", "ignore"] = "auto"  # what transparent pixels mean (`SceneConfig`)
+    notes: tuple[str, ...] = ()  # what was decided while it was read, a line each
+    offset: Position = NO_OFFSET  # that was subtracted from all positions of the capture, world units
 
     @cached_property
     def extent(self) -> float:

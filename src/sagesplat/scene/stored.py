@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import Meta
 
 from sagesplat.core.errors import SceneError, short
+from sagesplat.core.geometry import NO_OFFSET, Position
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
@@ -46,6 +47,7 @@ def write_scene(path: Path, scene: Scene) -> None:
         "views": views,
         "test": [names[i] for i in scene.test_ids],
         "calibration": [names[i] for i in scene.calibration_ids],
+        "offset": scene.offset,
     }
     arrays = {name: getattr(scene.points, name) for name in _POINTS}
     with atomic_path(path) as temporary:
@@ -77,6 +79,7 @@ class _About:
     views: list[_View]
     test: frozenset[str]
     calibration: frozenset[str]
+    offset: Position = NO_OFFSET
 
 
 def read_scene(path: Path) -> Scene:
@@ -95,7 +98,7 @@ def read_scene(path: Path) -> Scene:
         raise SceneError(f"{path}: not a stored scene ({short(error)}); make it again") from None
     return Scene(
         repaired(about.name), path, views, points,
-        test_names=about.test, calibration_names=about.calibration,
+        test_names=about.test, calibration_names=about.calibration, offset=about.offset,
     )  # fmt: skip
 
 

@@ -126,7 +126,7 @@ def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
     panoptic = coco.read_panoptic(folder)
     if panoptic is None:
         raise LabelError(
-            f"{folder}: no labels.json; write one like "
+            f"{folder}: no labels.json, and not the two values of masks of what counts; write one like "
             '{"unlabelled": 255, "labels": {"184": "tree-merged"}}'
         )
     taxonomy = taxonomy_of(panoptic.names, folder)

@@ -1,11 +1,12 @@
 """Pixels that count: what does not belong to a scene is not trained on, not measured and has no vote.
 
-Pixels do not count where a category is ignored, where a mask of the photo is black (`masks_valid/`, the
+Pixels do not count where a category is ignored, where a mask of the photo is black (`scene.given_masks`, the
 `mask_path` of nerfstudio), and where a photo is transparent and that means it (`Scene.alpha`).
 """
 
 import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +14,19 @@ from jaxtyping import Bool, Float32
 from PIL import Image
 from scipy.ndimage import minimum_filter
 
-from sagesplat.core.errors import LabelError
+from sagesplat.core.errors import LabelError, SceneError
 from sagesplat.io.files import atomic_path
-from sagesplat.scene.detect import VALID_FOLDER
+from sagesplat.scene.given_masks import INVERTED_FOLDER, GivenMask, GivenMasks
 from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
 from sagesplat.scene.raw_photos import RawPhoto, raw_photos
 from sagesplat.scene.scene import Scene, View
 from sagesplat.segment.fit import fit
-from sagesplat.segment.masks import CACHE_BYTES, Masks, given_png, mask_path
+from sagesplat.segment.masks import CACHE_BYTES, Masks, mask_path
 
 Pixels = Bool[np.ndarray, "H W"]
+_LOOKED_AT = 24  # views whose points tell which pixels of masks count
+_FEW = 50  # observations that are too few to tell
+_HARDLY_ANY = 0.05  # of those in black, for the area
 
 
 class ValidPixels:
@@ -79,6 +83,8 @@ def write_valid(
     label_ids: Masks | None = None,
     ignore: Collection[int] = (),
     dilation: int = 0,
+    folder: Path | None = None,
+    say: Callable[[str], object] = lambda line: None,
 ) -> Float32[np.ndarray, " V"]:
     """Find the pixels of all views that do not count, and write an image for each view that has some.
 
@@ -88,6 +94,8 @@ def write_valid(
         label_ids: Label images; needed for `ignore`.
         ignore: Category ids whose pixels do not count.
         dilation: Pixels by which regions that do not count are grown.
+        folder: Of masks, besides those that lie beside the photos.
+        say: Called with a line on the masks that came with the photos, if any did.
 
     Returns:
         Share of each view's pixels that do not count; 1 where none does.
@@ -96,7 +104,9 @@ def write_valid(
         LabelError: For masks that cannot be used, or where no pixel of a training view is left.
     """
     shutil.rmtree(target, ignore_errors=True)
-    given, transparent = _Given(scene), ignores_alpha(scene)
+    given, transparent = _Given(scene, folder), ignores_alpha(scene)
+    if given.line:
+        say(given.line)
     shares = np.zeros(len(scene.views), np.float32)
     for row, view in enumerate(scene.views):
         valid = given(view)
@@ -124,34 +134,79 @@ def write_view(folder: Path, view: View, valid: Pixels) -> None:
 
 
 class _Given:
-    """The masks that came with the photos: `masks_valid/`, and those that views name."""
+    """The masks that came with the photos: in folders (`scene.given_masks`), and those that views name."""
 
-    def __init__(self, scene: Scene):
-        folder = scene.path / VALID_FOLDER
-        self.folder = folder if folder.is_dir() else None
-        self.raw = raw_photos(scene.path) if self.folder else {}
+    def __init__(self, scene: Scene, folder: Path | None):
+        masks = given_masks(scene, folder)
+        self.raw = raw_photos(scene.path) if masks else {}
+        self.found = {view.name: mask for view in scene.views if (mask := masks.of(view.name)) is not None}
         # structure from motion may have left out all photos with a mask, and wrote the folder itself
-        if self.folder and not self.raw and not any(self._in_folder(view) for view in scene.views):
-            name = mask_path(self.folder, scene.views[0]).name
-            raise LabelError(f"{self.folder}: no mask of any photo; name them like the photos ({name}, ...)")
+        named = any(view.valid_path for view in scene.views)  # by their capture, whatever they are called
+        if masks.folders and not self.raw and not self.found and not named:
+            name = mask_path(masks.folders[0], scene.views[0]).name
+            raise LabelError(
+                f"{masks.folders[0]}: no mask of any photo; name them like the photos ({name}, ...)"
+            )
+        self.line = self._line(scene) if self.found else ""
+        if named and not self.found:
+            self.line = "masks that the capture names: black pixels do not count"
 
     def __call__(self, view: View) -> Pixels:
         """Whether the pixels of a view count, at the size of its camera."""
         valid = np.ones((view.camera.height, view.camera.width), bool)
-        if (path := self._in_folder(view)) is not None:
-            valid &= _seen(path, view, self.raw.get(view.name))
+        if (mask := self.found.get(view.name)) is not None:
+            valid &= _seen(mask, view, self.raw.get(view.name))
         if view.valid_path is not None:
-            valid &= _seen(view.valid_path, view, None)
+            valid &= _seen(GivenMask(view.valid_path, inverted=False), view, None)
         return valid
 
-    def _in_folder(self, view: View) -> Path | None:
-        return None if self.folder is None else given_png(self.folder, view.name)
+    def _line(self, scene: Scene) -> str:
+        """Turn masks that are inverted by all that points tell; what was found, in words."""
+        first = next(iter(self.found.values()))
+        count = f"masks of {len(self.found)} of {len(scene.views)} photos, such as {first.path}"
+        if any(mask.inverted for mask in self.found.values()):
+            return f"{count}: white pixels do not count, as their names say"
+        if self._hide_all_points(scene):
+            self.found = {name: replace(mask, inverted=True) for name, mask in self.found.items()}
+            return f"{count}: white pixels do not count, since the points of the scene are all in black"
+        cure = f"if it is the white ones, name the folder {INVERTED_FOLDER}"
+        return f"{count}: black pixels do not count ({cure})"
+
+    def _hide_all_points(self, scene: Scene) -> bool:
+        """Whether hardly any point was observed where the masks are white, for how much of photos that is."""
+        points, seen, area = scene.points, np.zeros(2), np.zeros(2)
+        rows = [row for row, view in enumerate(scene.views) if view.name in self.found]
+        for row in rows[:: len(rows) // _LOOKED_AT + 1]:
+            valid = self(scene.views[row])
+            x, y = points.track_uv[points.track_views == row].T.astype(int)
+            white = valid[y.clip(0, len(valid) - 1), x.clip(0, valid.shape[1] - 1)]
+            seen += [white.sum(), (~white).sum()]
+            area += [valid.sum(), (~valid).sum()]
+        if seen.sum() < _FEW or not area.all():
+            return False
+        in_white, in_black = seen / area
+        return bool(in_white < _HARDLY_ANY * in_black)
 
 
-def _seen(path: Path, view: View, raw: RawPhoto | None) -> Pixels:
+def describe_masks(scene: Scene) -> str:
+    """A line on the masks that came with the photos of a scene, and which pixels count; "" without any."""
+    try:
+        return _Given(scene, None).line
+    except (LabelError, SceneError) as error:
+        return str(error)
+
+
+def given_masks(scene: Scene, folder: Path | None = None) -> GivenMasks:
+    """The masks that lie beside the photos of a scene, or in `folder`."""
+    view = scene.views[0]
+    photos = view.image_path.parents[view.name.count("/")]
+    return GivenMasks([scene.path, photos.parent], photos, folder)
+
+
+def _seen(mask: GivenMask, view: View, raw: RawPhoto | None) -> Pixels:
     """A mask of a photo as the view's camera sees it."""
-    valid = read_black(path, view.camera.width * view.camera.height)
-    return fit(valid.astype(np.int16), view, raw, path).astype(bool)
+    valid = mask.read(view.camera.width * view.camera.height)
+    return fit(valid.astype(np.int16), view, raw, mask.path).astype(bool)
 
 
 def opaque(view: View) -> Pixels:

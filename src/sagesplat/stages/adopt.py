@@ -20,6 +20,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.formats.levels import read_header, read_level, read_more, write_level, write_set
+from sagesplat.formats.splat import relative_to
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.io.typed import check_limits
 from sagesplat.run.job import Job
@@ -72,7 +73,8 @@ def open_splat(
     check_limits(config)
     own = job.run.capture / repaired(source.resolve().stem)
     photos = _make_capture(job, source, own, config, scene, labelled=not segmented)
-    open_scene(job, config.cameras if photos and config.cameras else own, scene)
+    offset = tuple(read_more(job.run.adopted, "offset").astype(float).tolist())
+    open_scene(job, config.cameras if photos and config.cameras else own, scene, offset=offset)
     if not segmented:
         masks = replace(masks, masks=own / "masks")
     make_masks(job, masks, labels)
@@ -112,6 +114,7 @@ def _make_capture(
             job.emit(Warned(f"{source}: {note}"))
         for reason, count in splat.dropped.items():
             job.emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
+        splat = relative_to(splat, given[0].offset) if given else splat
         check_size(splat.gaussians, str(source))
         if labelled:
             splat = _labelled(splat)
@@ -122,7 +125,7 @@ def _make_capture(
             cameras = [view.camera for view in views]
             up, how = upward(cameras) * FLIP, f"those of {config.cameras}"
         else:
-            cameras, up, how = _cameras(job, g, given, config)
+            cameras, up, how = _cameras(job, splat, given, config)
             views = _views(own, cameras)
             _write_model(own / "sparse" / "0", g, views, _points(g, config.seed))
         _write_pictures(job, own, splat, views, labelled=labelled, photos=photos)
@@ -137,7 +140,9 @@ def _make_capture(
             run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians{left_out}", how],
             antialiased=splat.antialiased, backend=job.backend,
         )  # fmt: skip
-        write_set(run.adopted, g, _LEVEL, exact=True, antialiased=splat.antialiased)
+        write_set(
+            run.adopted, g, _LEVEL, exact=True, antialiased=splat.antialiased, offset=np.array(splat.offset)
+        )  # fmt: skip
         return [
             f"{len(g):,} Gaussians ({splat.kind})",
             f"{len(cameras)} viewpoints, {run.contact_sheet}: {how}",
@@ -170,17 +175,20 @@ def _labelled(splat: Splat) -> Splat:
 
 
 def _cameras(
-    job: Job, g: Gaussians, given: Sequence[NamedCamera], config: AdoptConfig
+    job: Job, splat: Splat, given: Sequence[NamedCamera], config: AdoptConfig
 ) -> tuple[Sequence[Camera], np.ndarray, str]:
     """Where to look from, which direction is up there, and what that was decided by."""
     if given:
         cameras = [one.camera for one in given]
         return cameras, upward(cameras) * FLIP, f"those of {config.cameras}"
     drawn = free_cameras(
-        g, config.views, up=config.up, fov=config.fov, size=config.size, seed=config.seed, kind=config.kind,
-        backend=job.backend,
+        splat.gaussians, config.views, up=splat.up if config.up == "auto" else config.up, fov=config.fov,
+        size=config.size, seed=config.seed, kind=config.kind, backend=job.backend,
     )  # fmt: skip
-    return drawn.cameras, drawn.up, drawn.reason
+    reason = drawn.reason
+    if config.up == "auto" != splat.up:
+        reason = reason.replace("as given", "as nerfstudio wrote into the file")
+    return drawn.cameras, drawn.up, reason
 
 
 def _points(g: Gaussians, seed: int, most: int = _POINTS) -> np.ndarray:

@@ -12,7 +12,7 @@ from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.observe import as_unit, render_rgb
 from sagesplat.adapt.renders import Renders
 from sagesplat.core.config import AdoptConfig, NestConfig
-from sagesplat.core.events import Progress
+from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import packed, read_increments, write_increments
 from sagesplat.formats.levels import write_set
@@ -191,6 +191,8 @@ def _write(
         fine=range(coarse + 1, levels + 1), antialiased=job.antialiased,
     )  # fmt: skip
     sent = read_increments(run.increments, chunks)
+    if not lossless and (other := sum(chunk.format != "spz" for chunk in chunks)):
+        job.emit(Warned(f"{other} files are PLY: SPZ's steps of positions are larger than their Gaussians"))
     write_set(run.prefixes, sent, settings["steps"], ladder.sizes, replaces=ladder.replaces, exact=True)
     size, total = sum(chunk.nbytes for chunk in chunks), len(sent)
     top = read_prefixes(run.prefixes).load(levels)

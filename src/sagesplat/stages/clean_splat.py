@@ -15,15 +15,17 @@ from sagesplat.core.config import CleanConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted, Warned
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import offset_text
 from sagesplat.formats.labels import sidecar, write_or_remove_labels
+from sagesplat.formats.offsets import beside, read_offset, write_offset
 from sagesplat.formats.ply import WRITER as PLY_WRITER
 from sagesplat.formats.ply import read_ply_splat, select_ply
-from sagesplat.formats.splat import Splat, undrawable
+from sagesplat.formats.splat import Splat, relative_to, undrawable
 from sagesplat.formats.splats import read_splat, scene_writer, write_splat, writer_of
 from sagesplat.io.typed import check_limits
 from sagesplat.raster import Backend, device_of
 from sagesplat.scene import load_scene
-from sagesplat.scene.cameras import read_camera_file
+from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Points, Scene, View
 from sagesplat.stages.clean import CleanFigures, clean_lines, figures_of
@@ -55,8 +57,10 @@ def clean_splat(
     for reason, count in splat.dropped.items():
         emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
     check_size(splat.gaussians, str(source))
-    g, filtered = splat.gaussians.to(device_of(backend)), splat.antialiased
-    scene, photos, how = _views(g, filtered, cameras, backend)
+    given = [] if cameras is None else read_camera_file(cameras)
+    seen = relative_to(splat, given[0].offset) if given else splat
+    g, filtered = seen.gaussians.to(device_of(backend)), splat.antialiased
+    scene, photos, how = _views(g, seen, cameras, given, backend)
     real, rows = not isinstance(photos, Renders), list(range(len(scene.views)))
     floaters = find_floaters(
         g, scene, rows,
@@ -80,6 +84,8 @@ def clean_splat(
             antialiased=filtered, backend=backend,
         )  # fmt: skip
     _write(source, out, splat, cleaned.keep)
+    if any(splat.offset) and beside(out).exists():
+        how = f"{how}; positions are relative to {offset_text(splat.offset)} ({beside(out).name})"
     emit(StageDone("clean", time.perf_counter() - begin, (*lines, how)))
     return figures
 
@@ -97,20 +103,25 @@ def _check_paths(source: Path, out: Path, picture: Path | None, config: CleanCon
 
 
 def _views(
-    g: Gaussians, antialiased: bool, cameras: Path | None, backend: Backend
+    g: Gaussians, splat: Splat, cameras: Path | None, given: Sequence[NamedCamera], backend: Backend
 ) -> tuple[Scene, Photos, str]:
     """Where to look from, what is seen there, and where that comes from."""
     if cameras is None:
-        drawn = free_cameras(g, _VIEWS, up="auto", fov=_FOV, size=_SIZE, seed=0, kind="auto", backend=backend)
+        drawn = free_cameras(
+            g, _VIEWS, up=splat.up, fov=_FOV, size=_SIZE, seed=0, kind="auto", backend=backend
+        )
         scene = _scene_of(Path(), drawn.cameras)
-        return scene, Renders(g, scene.views, backend, antialiased), _DRAWN
-    given = read_camera_file(cameras)
+        return scene, Renders(g, scene.views, backend, splat.antialiased), _DRAWN
     if all(one.photo is not None for one in given):
         scene = load_scene(cameras, test_every=0)
         scene = replace(scene, views=tuple(replace(v, camera=v.camera.within(_SIDE)) for v in scene.views))
         return scene, Photos(scene.views), f"{len(scene.views)} photos of {cameras}"
     scene = _scene_of(cameras, [one.camera.within(_SIDE) for one in given])
-    return scene, Renders(g, scene.views, backend, antialiased), f"{len(scene.views)} cameras of {cameras}"
+    return (
+        scene,
+        Renders(g, scene.views, backend, splat.antialiased),
+        f"{len(scene.views)} cameras of {cameras}",
+    )
 
 
 def _scene_of(path: Path, cameras: Sequence[Camera]) -> Scene:
@@ -128,13 +139,16 @@ def _write(source: Path, out: Path, splat: Splat, keep: np.ndarray) -> None:
     """Write the Gaussians that stay; from PLY to PLY their rows with all properties that the file has."""
     stays = splat.gaussians.select(torch.from_numpy(keep))
     if splat.kind != "PLY" or writer_of(out) is not PLY_WRITER:
-        write_splat(out, stays, splat.names, parents=splat.parents, antialiased=splat.antialiased)
+        write_splat(
+            out, stays, splat.names, parents=splat.parents, antialiased=splat.antialiased, offset=splat.offset
+        )
         return
     g = read_ply_splat(source).gaussians
     drawn = ~torch.stack(list(undrawable(g).values())).any(0).numpy()
     labelled_here = torch.equal(g.label_ids[torch.from_numpy(drawn)], splat.gaussians.label_ids)
     drawn[drawn] = keep
     select_ply(source, out, drawn)
+    write_offset(out, read_offset(source))
     if labelled_here:  # and not by a file beside it
         sidecar(out).unlink(missing_ok=True)
     else:

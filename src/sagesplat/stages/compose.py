@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.formats.offsets import write_offset
 from sagesplat.formats.ply import write_ply
 from sagesplat.raster.classic import for_classic
 from sagesplat.run.job import Job
@@ -45,6 +46,7 @@ def compose_plan(job: Job) -> None:
         plan = main_plan(job)
         g = job.ladder.compose(plan.levels)
         write_ply(run.composed, classic(job, g), job.names(), parents=job.parents_by_id)
+        write_offset(run.composed, job.scene.offset)
         size = f"{plan.nbytes / 1e6:.1f} MB at 248 bytes each"
         if plan.transfer_bytes is not None:
             size = f"{plan.transfer_bytes / 1e6:.2f} MB to send ({run.composed.name}: {size})"

@@ -14,6 +14,7 @@ from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.geometry import offset_text
 from sagesplat.core.sh import BASES
 from sagesplat.formats.increments import (
     INDEX,
@@ -24,6 +25,7 @@ from sagesplat.formats.increments import (
     write_increments,
 )
 from sagesplat.formats.lod_meta import LOD_META
+from sagesplat.formats.offsets import beside, write_doubles, write_offset
 from sagesplat.formats.ply import WRITER as PLY_WRITER
 from sagesplat.formats.ply import write_ply
 from sagesplat.formats.splat import WriteLevels
@@ -47,7 +49,18 @@ def export_increments(job: Job, folder: Path, kind: FileFormat) -> int:
         raise RunError(f"{job.run.path}: these levels have no chunks; use --ladder nested")
     if folder.exists() and not (job.force and (folder / INDEX).exists()):
         raise RunError(f"{folder}: exists; choose a new folder (--force replaces one of chunks)")
-    return len(increment_files(job, folder, kind))
+    written = increment_files(job, folder, kind)
+    if other := sum(one.format != kind for one in written):
+        job.emit(Warned(f"{other} files are PLY: SPZ's steps of positions are larger than their Gaussians"))
+    _say_offset(job, "which the files do not say")
+    return len(written)
+
+
+def _say_offset(job: Job, where: str) -> None:
+    """Say what positions are relative to: no format of splats holds coordinates such as those in UTM."""
+    if any(offset := job.scene.offset):
+        text = offset_text(offset)
+        job.emit(Warned(f"positions are relative to {text}, {where}: add it for those of the capture"))
 
 
 def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]:
@@ -82,6 +95,7 @@ def export_scene(
     rasterize_mode: RasterizeMode | None = None,
     without: Sequence[str] = (),
     labels_inside: bool = False,
+    doubles: bool = False,
 ) -> int:
     """Write a level or a composition, whole or some categories, in the format of the path's name.
 
@@ -90,11 +104,13 @@ def export_scene(
 
     `rasterize_mode`: how the file will be drawn; None: as the run was trained where the format says so, else
     `classic`. `lod-meta.json` gets `levels`, or all there are, as levels of detail. `labels_inside`: a PLY
-    has the labels as a property, not beside it. Returns the number of Gaussians.
+    has the labels as a property, not beside it. `doubles`: positions of a PLY are doubles in the capture's
+    own coordinates. Returns the number of Gaussians.
     """
     writer = writer_of(path)
-    if labels_inside and writer is not PLY_WRITER:
-        raise RunError(f"{path}: --labels-inside is for .ply; leave it out")
+    for given, name in ((labels_inside, "labels-inside"), (doubles, "doubles")):
+        if given and writer is not PLY_WRITER:
+            raise RunError(f"{path}: --{name} is for .ply; leave it out")
     if rasterize_mode == "antialiased" and not job.antialiased:
         raise RunError(f"{job.run.path}: trained without antialiasing; leave out --rasterize-mode")
     if rasterize_mode == "classic" and writer.write_levels:
@@ -122,14 +138,19 @@ def export_scene(
         job.emit(Warned(_holes(job, whole, g, without)))
     if g.sh_degree > writer.sh_degree and bool(g.shN.any()):
         job.emit(Warned(f"{path}: the format holds no harmonics, which are left out"))
-    mode = rasterize_mode or ("antialiased" if writer.antialiases else "classic")
+    offset, mode = job.scene.offset, rasterize_mode or ("antialiased" if writer.antialiases else "classic")
     antialiased = mode == "antialiased" and job.antialiased
     g = g if antialiased else classic(job, g)
     kept = {"parents": job.parents_by_id, "antialiased": antialiased}
     if labels_inside:
         write_ply(path, g, job.names(), **kept, labels_inside=True)
+        write_offset(path, offset)
     else:
-        write_splat(path, g, job.names(), **kept)
+        write_splat(path, g, job.names(), **kept, offset=offset)
+    if doubles:
+        write_doubles(path, offset)
+    else:
+        _say_offset(job, f"written to {beside(path).name}")
     return len(g)
 
 
@@ -158,7 +179,8 @@ def _alpha(job: Job, g: Gaussians, camera: Camera) -> Tensor:
 def _check_folder(job: Job, folder: Path) -> None:
     """RunError unless `folder` is new, empty, or with --force holds an earlier export and nothing else."""
     inside = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
-    other = [name for name in inside if name != LOD_META and not re.fullmatch(r"\d+_\d+", name)]
+    ours = (LOD_META, beside(folder / LOD_META).name)
+    other = [name for name in inside if name not in ours and not re.fullmatch(r"\d+_\d+", name)]
     if other or (inside and not job.force) or (folder.exists() and not folder.is_dir()):
         raise RunError(f"{folder}: not empty; choose a new folder (--force replaces one that export wrote)")
 
@@ -170,4 +192,6 @@ def _export_levels(
     sets = [job.ladder.load(level, wanted) for level in chosen]
     sets = [g for i, g in enumerate(sets) if len(g) and (i == 0 or len(g) < len(sets[i - 1]))]
     write(path, sets, job.names(), job.parents_by_id, job.antialiased)
+    write_offset(path, job.scene.offset)
+    _say_offset(job, f"written to {beside(path).name}")
     return len(sets[0]) if sets else 0

@@ -128,7 +128,8 @@ def _measure_some(
 ) -> tuple[np.ndarray, np.ndarray]:
     cameras, planned, stage, only = part
     return measure_compositions(
-        job.ladder, cameras, planned, only=only, backend=job.backend, antialiased=job.antialiased,
+        job.ladder, cameras, planned, only=only, full=job.came_in, backend=job.backend,
+        antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress(stage, done, total)),
         references=job.references if only is None else None,
     )  # fmt: skip

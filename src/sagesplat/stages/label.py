@@ -22,7 +22,7 @@ from sagesplat.run.records import file_hash
 from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
-from sagesplat.scene.detect import VALID_FOLDER
+from sagesplat.scene.given_masks import holds_masks
 from sagesplat.segment.display_names import categories, title_of, titles
 from sagesplat.segment.edit import Edited, edit_labels, ignored_ids, parse_merge, parse_names
 from sagesplat.segment.lift import agreement_in, lift
@@ -30,7 +30,7 @@ from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, write_labels
 from sagesplat.segment.registry import SEGMENTERS, segmenter_for
 from sagesplat.segment.segmenters import segment_some
-from sagesplat.segment.valid import ValidPixels, write_valid
+from sagesplat.segment.valid import ValidPixels, given_masks, write_valid
 from sagesplat.stages.memory import check_network
 from sagesplat.stages.prompts import MASKS, Scores, Timed, load, prompt_lines, settings_of
 from sagesplat.stages.scene import check_not_adopted
@@ -55,18 +55,20 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
 
     def make() -> list[str]:
         shutil.rmtree(run.masks, ignore_errors=True)
-        ignored = _find_valid(job, labels, ignore, merge)
+        said = list[str]()
+        ignored = _find_valid(job, config, labels, ignore, merge, said)
         edited = edit_labels(
             run.segmented, job.scene.views, run.masks,
             keep=keep, merge=merge, ignore=ignore, min_share=labels.min_share, valid=ValidPixels(run.valid),
             on_view=lambda done, total: job.emit(Progress("masks", done, total)),
         )  # fmt: skip
         write_json(run.masks / _EDIT, {**edited.record, "table": edited.table.tolist()})
-        return [*_lines(edited), *_ignored_lines(ignored)]
+        return [*_lines(edited), *said, *_ignored_lines(ignored)]
 
     settings = {name: value for name, value in asdict(labels).items() if name != "instances"}
-    if (given := job.scene.path / VALID_FOLDER).is_dir():
-        settings["valid"] = file_hash(given)
+    given = given_masks(job.scene, _mask_folder(config))
+    if given:
+        settings["valid"] = [file_hash(place) for place in given.places]
     inputs = [run.provenance("segment"), run.segmented / "labels.json"]
     inputs += {view.valid_path: None for view in job.scene.views if view.valid_path}
     run_stage(job, "masks", settings, inputs, [run.masks / "labels.json"], make)
@@ -90,16 +92,24 @@ def later_merges(run: RunDir, labels: LabelsConfig) -> dict[str, str]:
 
 
 def _find_valid(
-    job: Job, labels: LabelsConfig, ignore: Sequence[str], merge: Mapping[str, str]
+    job: Job,
+    config: MasksConfig,
+    labels: LabelsConfig,
+    ignore: Sequence[str],
+    merge: Mapping[str, str],
+    said: list[str],
 ) -> Float32[np.ndarray, " V"]:
-    """Write which pixels count; the share of each view's pixels that do not."""
+    """Write which pixels count; the share of each view's pixels that do not. Lines go to `said`."""
     run, views = job.run, job.scene.views
     before = Taxonomy.read(run.segmented / "labels.json")
     ids, unseen = ignored_ids(before, ignore, merge)
     if unseen:
         job.emit(Warned(f"ignore: no photo shows {', '.join(unseen)}"))
     label_ids = Masks(run.segmented, before)
-    shares = write_valid(job.scene, run.valid, label_ids=label_ids, ignore=ids, dilation=_DILATION)
+    shares = write_valid(
+        job.scene, run.valid, label_ids=label_ids, ignore=ids, dilation=_DILATION,
+        folder=_mask_folder(config), say=said.append,
+    )  # fmt: skip
     if empty := [view.name for view, share in zip(views, shares, strict=True) if share == 1]:
         names = ", ".join(empty[:5]) + (", ..." if len(empty) > 5 else "")
         job.emit(Warned(f"{len(empty)} of {len(views)} photos have no pixel that counts: {names}"))
@@ -126,9 +136,15 @@ def segmenter_kind(capture: Path, config: MasksConfig) -> str:
     """The segmenter that was asked for, or with "auto" the one that the settings and the capture imply."""
     if config.segmenter != "auto":
         return config.segmenter
-    if not config.model and (config.masks or (capture / "masks").is_dir()):
+    folder = config.masks or capture / "masks"
+    if not config.model and (config.masks or folder.is_dir()) and not holds_masks(folder):
         return MASKS
     return "text" if config.prompts and not config.model else segmenter_for(config.model)
+
+
+def _mask_folder(config: MasksConfig) -> Path | None:
+    """The folder of --masks, where it holds masks of what counts rather than label images."""
+    return config.masks if config.masks is not None and holds_masks(config.masks) else None
 
 
 def _note_options(job: Job, config: MasksConfig) -> None:

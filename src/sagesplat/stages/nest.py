@@ -24,6 +24,8 @@ from sagesplat.train.early_stopping import VIEWS, spread
 from sagesplat.train.events import Resumed, Step, Trained
 from sagesplat.train.nested import NestStep
 
+_ROUNDED = 0.01  # SSIM that rounding may cost without a word
+
 
 def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     """Order the trained Gaussians and train their prefixes; write the ladder and its chunks."""
@@ -135,6 +137,13 @@ def write_ladder(
     write_set(job.run.prefixes, sent, config.steps, made.sizes, second=seconds)
     size, n = sum(one.nbytes for one in made.increments), len(sent)
     decoded, unrounded = _quality(job, sent, seconds), _quality(job, g, second)
+    if unrounded - decoded > _ROUNDED:
+        job.emit(
+            Warned(
+                f"rounding the levels costs {unrounded - decoded:.3f} of SSIM; Gaussians that lie far off "
+                "make the steps of positions large"
+            )
+        )
     return [
         f"{config.levels} levels, {len(g):,} Gaussians",
         f"{n:,} of them to be seen, in {len(made.sizes)} coded streams of {size / 1e6:.2f} MB, "

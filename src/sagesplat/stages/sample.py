@@ -54,7 +54,7 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
 
     def make() -> list[str]:
         own, given = capture_cameras(job.scene), config.viewpoints
-        base = own if given is None else read_cameras(given, own[0])
+        base = own if given is None else read_cameras(given, own[0], job.scene.offset)
         counts = _counts(job, config)
         drawn = draw(job.scene, base, rule, counts, given.name if given else "capture")
         table, used = _until_it_stops_shrinking(job, drawn, fit, bool(config.views))
@@ -154,7 +154,7 @@ def _measure_some(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     cameras, only = part
     return measure_levels(
-        job.ladder, cameras, only=only, backend=job.backend, antialiased=job.antialiased,
+        job.ladder, cameras, only=only, full=job.came_in, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("sample", done, total)),
     )  # fmt: skip
 

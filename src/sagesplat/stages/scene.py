@@ -9,7 +9,9 @@ import numpy as np
 from sagesplat.core.config import LabelsConfig, MasksConfig, PosesConfig, SceneConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress, Warned
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_text
 from sagesplat.core.names import repaired
+from sagesplat.io.colour_profile import describe_profiles
 from sagesplat.io.files import write_json
 from sagesplat.run.capture import Capture, Hashes, check_photos, fingerprint, photo_hashes, read_capture
 from sagesplat.run.job import Job
@@ -19,6 +21,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
 from sagesplat.scene.feature_masks import OfPhoto
+from sagesplat.scene.given_masks import holds_masks
 from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.edit import ignored_ids, parse_merge, parse_names
@@ -58,10 +61,13 @@ def open_scene(
     poses: PosesConfig | None = None,
     masks: MasksConfig | None = None,
     labels: LabelsConfig | None = None,
+    *,
+    offset: Position = NO_OFFSET,
 ) -> None:
     """Read a capture and write scene.json. For photos without poses, or a video, estimate the poses first.
 
-    Then no features come from what the photos' alpha, masks and given label images leave out.
+    Then no features come from what the photos' alpha, masks and given label images leave out. `offset` was
+    subtracted from the positions of a capture that was made of an adopted splat.
     """
     run = job.run
     check_folder(run)
@@ -76,6 +82,7 @@ def open_scene(
     same = begun and not job.force and begun.settings == asdict(config)
     again = begun and same and begun.path == path.resolve()  # what was found in the photos is known
     scene = begun.load() if begun and again else load_scene(path, **asdict(config))
+    scene = scene if any(scene.offset) else replace(scene, offset=offset)
     photos, found = photo_hashes(run.photo_hashes, scene), scene.views[0].vignetting
     settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
     settings["photos"] = photos.digest
@@ -92,6 +99,7 @@ def open_scene(
                 "photos": photos.sha256,
                 "vignetting": found and asdict(found),
                 "extent": scene.extent,
+                "offset": scene.offset,
                 "points": len(scene.points.xyz),
                 "views": [
                     {
@@ -111,7 +119,11 @@ def open_scene(
         lines = [
             f"{len(scene.train_ids)} training, {len(scene.test_ids)} test views, {size.width}x{size.height}",
             f"{len(scene.points.xyz):,} points",
+            *scene.notes,
         ]
+        if any(scene.offset):
+            lines.append(f"far from the origin: {offset_text(scene.offset)} is subtracted from all positions")
+        lines += describe_profiles(view.image_path for view in scene.views)
         if config.vignetting:
             lines.append(_of_lens(found))
         return lines
@@ -179,7 +191,8 @@ class _LeavingOut:
     def folder(self) -> Path | None:
         """Label images whose ignored categories are known before there are poses."""
         given = self.labels.ignore and self.masks.segmenter in ("auto", "masks")
-        return self.masks.masks if given else None
+        folder = self.masks.masks if given else None
+        return None if folder is not None and holds_masks(folder) else folder
 
     @property
     def settings(self) -> dict[str, Any]:

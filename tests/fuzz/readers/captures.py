@@ -9,7 +9,7 @@ from typing import Any
 
 import av
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageCms
 
 from sagesplat.core.errors import SceneError
 from sagesplat.io.pictures import PictureError
@@ -20,6 +20,7 @@ from sagesplat.scene.exif import exposure_of
 from sagesplat.scene.images import has_alpha, load_alpha, load_photo, photo_size, read_black
 from sagesplat.scene.nerfstudio import load_transforms
 from sagesplat.scene.points import read_points
+from sagesplat.scene.scans import load_metashape, load_polycam, load_record3d
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.coco import read_panoptic
 from sagesplat.segment.instances import read_instances, write_instances
@@ -82,6 +83,52 @@ def _transforms(folder: Path, size: int) -> list[bytes]:
     return as_json({**shared, "frames": frames}, {**shared, **listed, "camera_angle_x": 1, "frames": frames})
 
 
+def _polycam(folder: Path, size: int) -> list[bytes]:
+    """A camera of Polycam, beside two others that are sound."""
+    put_photos(folder / "keyframes/images")
+    cameras = []
+    for i in range(len(PHOTOS)):
+        camera = dict.fromkeys((f"t_{row}{column}" for row in range(3) for column in range(4)), 0.0)
+        camera |= {"t_00": 1.0, "t_11": 1.0, "t_22": 1.0, "t_03": i, "fx": 14, "fy": 14, "cx": 8, "cy": 6}
+        cameras.append(camera | {"width": 16, "height": 12} | {f"note{n}": 0.5 for n in range(size - 1)})
+    for name, camera in zip(PHOTOS[1:], cameras[1:], strict=True):
+        put(folder / "keyframes/cameras" / f"{Path(name).stem}.json", json.dumps(camera).encode())
+    return as_json(cameras[0])
+
+
+def _record3d(folder: Path, size: int) -> list[bytes]:
+    (folder / "rgbd").mkdir(parents=True, exist_ok=True)
+    for i in range(3):
+        Image.new("RGB", (16, 12)).save(folder / "rgbd" / f"{i}.jpg")
+    poses = [[0, 0, 0, 1, i, 0, 0] for i in range(2 + size)]
+    made = {"w": 16, "h": 12, "K": [14, 0, 0, 0, 14, 0, 8, 6, 1], "poses": poses}
+    return as_json(made, {**made, "perFrameIntrinsicCoeffs": [[14, 14, 8, 6]] * len(poses)})
+
+
+def _metashape(folder: Path, size: int) -> list[bytes]:
+    put_photos(folder)
+    pose = "1 0 0 {} 0 1 0 0 0 0 1 0 0 0 0 1"
+    cameras = "".join(
+        f'<camera id="{i}" sensor_id="0" label="{name}"><transform>{pose.format(i)}</transform></camera>'
+        for i, name in enumerate(PHOTOS)
+    )
+    cameras += "".join(f'<camera id="{i}" label="x"/>' for i in range(size - 1))
+    values = '<resolution width="16" height="12"/><f>14</f><cx>0.5</cx><k1>0.01</k1><p1>0.001</p1>'
+    return [
+        f'<?xml version="1.0"?><document version="2.0.0"><chunk><sensors><sensor id="0" type="{kind}">'
+        f'<calibration type="{kind}">{values}</calibration></sensor></sensors><cameras>{cameras}</cameras>'
+        f"<transform><scale>2</scale></transform></chunk></document>".encode()
+        for kind in ("frame", "spherical")
+    ]
+
+
+def _profiled() -> bytes:
+    """A colour profile that is not sRGB's: red and blue are exchanged."""
+    content = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    content = content.replace("sRGB".encode("utf-16-be"), "tRGB".encode("utf-16-be"))
+    return content.replace(b"rXYZ", b"    ").replace(b"bXYZ", b"rXYZ").replace(b"    ", b"bXYZ")
+
+
 def _picture(mode: str, size: int, **options: Any) -> bytes:
     content = io.BytesIO()
     Image.new(mode, (16 * size, 12 * size), 9).save(content, **options)
@@ -95,6 +142,7 @@ def _photos(folder: Path, size: int) -> list[bytes]:
     return [
         _picture("RGB", size, format="PNG"),
         _picture("RGB", size, format="JPEG", exif=exif),
+        _picture("RGB", size, format="JPEG", icc_profile=_profiled()),
         _picture("L", size, format="JPEG"),
         _picture("LA", size, format="PNG"),
         _picture("I;16", size, format="PNG"),
@@ -217,6 +265,11 @@ READERS = (
     Reader("ply-points", ".ply", points, file("p.ply", read_points)),
     # Without a PLY file there are 100,000 random points.
     Reader("transforms", ".json", _transforms, file("transforms.json", load_transforms), 3000, 64 * MIB),
+    Reader("polycam", ".json", _polycam,
+           file("keyframes/cameras/a.json", lambda path: load_polycam(path.parents[2])), 3000, 64 * MIB),
+    Reader("record3d", ".json", _record3d,
+           file("metadata.json", lambda path: load_record3d(path.parent)), 3000, 64 * MIB),
+    Reader("metashape", ".xml", _metashape, file("cameras.xml", load_metashape), 3000, 64 * MIB),
     Reader("mask", ".png", _masks, file("m.png", lambda path: read_mask(path, TAXONOMY))),
     Reader("instances", ".png", written_by("i.png", _write_instances), file("i.png", read_instances)),
     Reader("label-image", ".png", _masks, _import),

@@ -14,6 +14,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.increments import read_increments, read_index, totals
 from sagesplat.formats.levels import check_level, read_level, write_level, write_set
+from sagesplat.formats.offsets import read_offset
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.spz import encode_spz, read_spz
 from sagesplat.formats.stream import decode_stream, encode_stream
@@ -151,6 +152,13 @@ def _stored(folder: Path, size: int) -> list[bytes]:
 
 READERS = (
     Reader("ply-splats", ".ply", _ply, file("g.ply", read_ply)),
+    Reader(
+        "offset",
+        ".xyz",
+        lambda folder, size: [b"412346 5312345 188" + b" " * size + b"\n"],
+        file("g.ply.offset.xyz", lambda path: read_offset(path.with_name("g.ply"))),
+        3000,
+    ),
     Reader("spz", ".spz", _spz, file("g.spz", read_spz), 10_000),
     Reader("stream", ".sgst", _streams, lambda folder, content: decode_stream(content), 10_000),
     Reader("chunks", ".json", _index, file("index.json", _read_index)),

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.geometry import NO_OFFSET, Position
 from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import repaired
 from sagesplat.formats.increments import INDEX, Increment, Refine, read_increments, read_index, shown
@@ -17,6 +18,7 @@ from sagesplat.formats.lod_meta import LOD_META, level_files
 from sagesplat.formats.sog import META
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.io.typed import convert_as, read_json_as, refused
+from sagesplat.run.capture import read_capture
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.display_names import titles
@@ -142,12 +144,14 @@ def _of_run(path: Path, name: str) -> list[Level]:
     apart = (run.instances / "labels.json").exists()
     folder = run.block_labels if in_blocks else run.instances if apart else run.masks
     names = titles(Taxonomy.read(folder / "labels.json").names)
-    return _of_chunks(run.increments, read_index(run.increments), names, name, antialiased)
+    offset = read_capture(run.scene).offset
+    return _of_chunks(run.increments, read_index(run.increments), names, name, antialiased, offset)
 
 
 def _of_chunks(
-    folder: Path, listed: Sequence[Increment], names: dict[int, str], name: str, antialiased: bool
-) -> list[Level]:
+    folder: Path, listed: Sequence[Increment], names: dict[int, str], name: str, antialiased: bool,
+    offset: Position = NO_OFFSET,
+) -> list[Level]:  # fmt: skip
     labels = sorted({chunk.label_id for chunk in listed})
     if not labels:
         raise DataError(f"{folder.parent}: no levels in it; {_BUNDLE_CURE}")
@@ -156,7 +160,8 @@ def _of_chunks(
         chunks = [chunk for label in labels for chunk in shown(listed, label, number)]
 
         def load(chunks: Sequence[Increment] = chunks) -> Splat:
-            return Splat(read_increments(folder, chunks), "increments", names, antialiased)
+            g = read_increments(folder, chunks)
+            return Splat(g, "increments", names, antialiased, offset=offset)
 
         levels.append(Level(f"{name} level {number}", name, sum(chunk.nbytes for chunk in chunks), load))
     return levels

@@ -1,7 +1,7 @@
 """Measures how close levels of detail are to their scene, whoever made them."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,8 @@ from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageStarted, Warned
+from sagesplat.core.geometry import Position
+from sagesplat.formats.splat import relative_to
 from sagesplat.formats.splats import Splat
 from sagesplat.io.typed import check_limits
 from sagesplat.metrics import flip
@@ -52,7 +54,8 @@ def measure(
         what = ", ".join(f"{count:,} {reason}" for reason, count in truth.dropped.items())
         emit(Warned(f"{reference.name}: Gaussians left out: {what}"))
     check_size(truth.gaussians, reference.name)
-    cameras, views, lines = _viewpoints(truth, config, backend)
+    cameras, views, lines, offset = _viewpoints(truth, config, backend)
+    truth, levels = relative_to(truth, offset), [_near(level, offset) for level in levels]
     renderer, total = Renderer(backend), len(levels) * len(cameras)
     if not any(renderer.covered(truth, camera).any() for camera in cameras):
         raise RunError(
@@ -101,20 +104,33 @@ def _levels(paths: Sequence[Path]) -> tuple[Level, list[Level], list[str]]:
 
 def _viewpoints(
     truth: Splat, config: MeasureConfig, backend: Backend
-) -> tuple[list[Camera], list[str], list[str]]:
-    """Viewpoints, their names, and lines about them."""
+) -> tuple[list[Camera], list[str], list[str], Position]:
+    """Viewpoints, their names, lines about them, and the offset of their positions."""
     if config.cameras is None:
         size = config.size, max(1, round(0.75 * config.size))
         drawn = free_cameras(
-            truth.gaussians, config.views, up=config.up, fov=config.fov, size=size, seed=config.seed,
-            kind=config.kind, backend=backend,
+            truth.gaussians, config.views, up=truth.up if config.up == "auto" else config.up, fov=config.fov,
+            size=size, seed=config.seed, kind=config.kind, backend=backend,
         )  # fmt: skip
-        return list(drawn.cameras), [f"{i:03}" for i in range(1, len(drawn.cameras) + 1)], [drawn.reason]
+        names = [f"{i:03}" for i in range(1, len(drawn.cameras) + 1)]
+        return list(drawn.cameras), names, [drawn.reason], truth.offset
     found = read_camera_file(config.cameras)
     picked = np.linspace(0, len(found) - 1, min(config.views, len(found))).round().astype(int)
     some = [found[i] for i in picked]
     line = f"{len(some)} of the {len(found)} cameras of {config.cameras.name}"
-    return [one.camera.within(config.size) for one in some], [one.name for one in some], [line]
+    near = [one.camera.within(config.size) for one in some]
+    return near, [one.name for one in some], [line], some[0].offset
+
+
+def _near(level: Level, offset: Position) -> Level:
+    """The level with positions relative to an offset; those of a bundle, which says none, are as they are."""
+
+    def load() -> Splat:
+        splat = level.load()
+        known = any(splat.offset) or splat.kind != "increments"
+        return relative_to(splat, offset) if known else splat
+
+    return replace(level, load=load)
 
 
 def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, renderer: Renderer) -> Strip:

@@ -1,0 +1,334 @@
+"""Loads what scanner apps and Metashape export: Polycam's and Record3D's folders, cameras in Metashape's XML.
+
+Each is turned into the frames of a transforms.json, which `nerfstudio.load_transforms` loads: camera to world
+with OpenGL axes, in the file's own world. Depth images are not read.
+
+Polycam, raw data: keyframes/images/N.jpg with keyframes/cameras/N.json, or corrected_images and
+corrected_cameras, which Polycam made by bundle adjustment. Record3D: rgbd/N.jpg or rgb/N.jpg, and
+metadata.json with `K` (by columns), `poses` (quaternion x y z w, then the position) and
+`perFrameIntrinsicCoeffs`. Metashape: "Export Cameras" as Agisoft XML; camera models are those of its manual,
+appendix D.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float64
+from msgspec import Meta
+from scipy.spatial.transform import Rotation
+
+from sagesplat.core.errors import SceneError, short
+from sagesplat.core.names import repaired
+from sagesplat.io.files import read_json, regular
+from sagesplat.io.typed import convert_as, refused
+from sagesplat.scene.given_masks import FOLDERS
+from sagesplat.scene.nerfstudio import LARGEST, load_transforms
+from sagesplat.scene.scene import Scene
+
+_PICTURES = (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff", ".webp")
+_DEPTHS = (".depth", ".exr")  # files of Record3D, besides folders named depth
+_LARGEST_XML = 2**26  # bytes; a camera takes about a thousand
+_NO_PIXELS = 0.5  # by which coefficients that other camera models lack may move a photo's corner
+_Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+_Quaternion = Annotated[list[_Number], Meta(min_length=7, max_length=7)]
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # between cameras that look along z, y down, and along -z, y up
+_METASHAPE_CURE = "export the cameras again (File, Export, Export Cameras, Agisoft XML)"
+
+
+def is_polycam(folder: Path) -> bool:
+    """Whether a folder is Polycam's export of raw data."""
+    return _polycam_cameras(folder) is not None
+
+
+def load_polycam(path: Path, **reading: Any) -> Scene:
+    """The scene of Polycam's raw data; `reading` as of `load_transforms`. Raises SceneError."""
+    cameras = _polycam_cameras(path)
+    if cameras is None:
+        raise SceneError(f"{path}: no keyframes/ with cameras; export Polycam's raw data again")
+    kind = "corrected_" if cameras.name == "corrected_cameras" else ""
+    photos = cameras.with_name(f"{kind}images")
+    photos = photos if photos.is_dir() else cameras.with_name("images")
+    files, by_stem = sorted(cameras.glob("*.json"), key=_number), _pictures(photos)
+    frames = [
+        _polycam_frame(file, by_stem[file.stem.lower()]) for file in files if file.stem.lower() in by_stem
+    ]
+    notes = [f"Polycam's {cameras.name.replace('_', ' ')}: {len(frames)} of {len(files)} have a photo"]
+    notes += _depth_notes(cameras.parent, "depth", "confidence")
+    return _scene(path, cameras, frames, notes, reading)
+
+
+def _polycam_cameras(folder: Path) -> Path | None:
+    """The folder with the poses: corrected ones, where there are some."""
+    places = (folder / "keyframes" / name for name in ("corrected_cameras", "cameras"))
+    return next((place for place in places if next(place.glob("*.json"), None)), None)
+
+
+@dataclass(frozen=True)
+class _PolycamCamera:
+    """A camera of Polycam: t_ij are row i of camera to world."""
+
+    fx: _Number
+    fy: _Number
+    cx: _Number
+    cy: _Number
+    width: _Number
+    height: _Number
+    t_00: _Number
+    t_01: _Number
+    t_02: _Number
+    t_03: _Number
+    t_10: _Number
+    t_11: _Number
+    t_12: _Number
+    t_13: _Number
+    t_20: _Number
+    t_21: _Number
+    t_22: _Number
+    t_23: _Number
+
+    def frame(self, photo: str) -> dict[str, Any]:
+        rows = [[getattr(self, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+        return {
+            "file_path": photo, "w": self.width, "h": self.height, "fl_x": self.fx, "fl_y": self.fy,
+            "cx": self.cx, "cy": self.cy, "transform_matrix": rows,
+        }  # fmt: skip
+
+
+def _polycam_frame(file: Path, photo: Path) -> dict[str, Any]:
+    content = read_json(file, "export the raw data again", SceneError)
+    with refused(file, "a camera of Polycam", "export the raw data again", SceneError):
+        camera = convert_as(content, _PolycamCamera)
+    return camera.frame(photo.relative_to(file.parents[1]).as_posix())
+
+
+def is_record3d(folder: Path) -> bool:
+    """Whether a folder is Record3D's export of photos with metadata."""
+    return (folder / "metadata.json").is_file() and _record3d_photos(folder) is not None
+
+
+def _record3d_photos(folder: Path) -> Path | None:
+    return next((folder / name for name in ("rgbd", "rgb") if (folder / name).is_dir()), None)
+
+
+@dataclass(frozen=True)
+class _Record3D:
+    w: _Number
+    h: _Number
+    K: Annotated[list[_Number], Meta(min_length=9, max_length=9)]
+    poses: list[_Quaternion]
+    perFrameIntrinsicCoeffs: list[list[_Number]] | None = None
+
+
+def load_record3d(path: Path, **reading: Any) -> Scene:
+    """The scene of Record3D's photos and metadata.json; `reading` as of `load_transforms`. SceneError."""
+    file, photos = path / "metadata.json", _record3d_photos(path)
+    if photos is None:
+        raise SceneError(f"{path}: no rgbd/ or rgb/ beside metadata.json; export it again, with photos")
+    content = read_json(file, "export it from Record3D again", SceneError)
+    with refused(file, "metadata of Record3D", "export it from Record3D again", SceneError):
+        made = convert_as(content, _Record3D)
+        own = made.perFrameIntrinsicCoeffs or []
+        if own and (len(own) != len(made.poses) or any(len(values) < 4 for values in own)):
+            raise ValueError(f"intrinsics of {len(own)} frames for {len(made.poses)} poses")
+        poses = np.array(made.poses, np.float64).reshape(-1, 7)
+        if not (np.linalg.norm(poses[:, :4], axis=1) > 1e-6).all():
+            raise ValueError("a pose without a rotation")
+    by_stem, frames = _pictures(photos), []
+    for number, pose in enumerate(poses):
+        if (photo := by_stem.get(str(number))) is None:
+            continue
+        c2w = np.eye(4)
+        c2w[:3, :3], c2w[:3, 3] = Rotation.from_quat(pose[:4]).as_matrix(), pose[4:]
+        fx, fy, cx, cy = own[number][:4] if own else (made.K[0], made.K[4], made.K[6], made.K[7])
+        frames.append({
+            "file_path": photo.relative_to(path).as_posix(), "w": made.w, "h": made.h, "fl_x": fx, "fl_y": fy,
+            "cx": cx, "cy": cy, "transform_matrix": c2w.tolist(),
+        })  # fmt: skip
+    notes = [f"Record3D: {len(frames)} of {len(poses)} poses have a photo"]
+    notes += _depth_notes(path, "depth", photos.name)
+    return _scene(path, file, frames, notes, reading)
+
+
+def is_metashape(folder: Path) -> bool:
+    """Whether a folder holds an XML file of Metashape's cameras."""
+    return _metashape_file(folder) is not None
+
+
+def _metashape_file(folder: Path) -> Path | None:
+    return next((file for file in sorted(folder.glob("*.xml")) if _is_metashape_xml(file)), None)
+
+
+def _is_metashape_xml(file: Path) -> bool:
+    try:
+        with regular(file).open("rb") as opened:
+            head = opened.read(4096)
+    except OSError:
+        return False
+    return b"<document" in head and b"<chunk" in head
+
+
+def load_metashape(path: Path, **reading: Any) -> Scene:
+    """The scene of Metashape's cameras, an XML file or its folder; `reading` as of `load_transforms`.
+
+    Photos are found by the cameras' labels, beside the file or below it. SceneError.
+    """
+    file = path if path.is_file() else _metashape_file(path)
+    if file is None:
+        raise SceneError(f"{path}: no XML file of Metashape's cameras; {_METASHAPE_CURE}")
+    try:
+        content = regular(file).read_bytes()
+        if len(content) > _LARGEST_XML or b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+            raise ValueError("too large, or with entities")
+        chunks = ElementTree.fromstring(content).findall("chunk")
+        if len(chunks) != 1:
+            raise ValueError(f"{len(chunks)} chunks; export one")
+        frames, total = _metashape_frames(chunks[0], _pictures(file.parent))
+    except OSError as error:
+        raise SceneError(f"{file}: cannot be read ({error.strerror}); {_METASHAPE_CURE}") from None
+    except (ValueError, ElementTree.ParseError) as error:
+        raise SceneError(f"{file}: not cameras of Metashape ({short(error)}); {_METASHAPE_CURE}") from None
+    if not frames:
+        raise SceneError(f"{file}: none of its {total} cameras has a pose and a photo; put photos beside it")
+    notes = [f"{file.name} of Metashape: {len(frames)} of {total} cameras have a pose and a photo"]
+    return _scene(file.parent, file, frames, notes, reading)
+
+
+def _metashape_frames(
+    chunk: ElementTree.Element, by_stem: dict[str, Path]
+) -> tuple[list[dict[str, Any]], int]:
+    """The frames of the aligned cameras whose photos are there, and the number of all cameras."""
+    lenses = {sensor.get("id"): _metashape_lens(sensor) for sensor in chunk.iterfind("sensors//sensor")}
+    parts = {one.get("id"): one.find("transform") for one in chunk.iterfind("components//component")}
+    frames, cameras = [], list(chunk.iterfind("cameras//camera"))
+    for camera in cameras:
+        placed, label = camera.findtext("transform"), (camera.get("label") or "").strip()
+        if placed is None or camera.get("enabled", "true").lower() in ("false", "0"):
+            continue
+        photo = by_stem.get(label.lower()) or by_stem.get(Path(label.replace("\\", "/")).stem.lower())
+        if photo is None:
+            continue
+        lens = lenses.get(camera.get("sensor_id"))
+        if lens is None:
+            raise ValueError(f"camera {short(repr(label))} without a calibrated sensor")
+        c2w = _floats(placed, 16).reshape(4, 4)
+        part = parts.get(camera.get("component_id"))
+        c2w = _to_world(part if part is not None else chunk.find("transform")) @ c2w
+        c2w[:3, :3] /= np.cbrt(max(np.linalg.det(c2w[:3, :3]), 1e-30))  # positions keep the scale
+        frames.append({"file_path": photo, "transform_matrix": (c2w @ _OPENGL).tolist(), **lens})
+    return frames, len(cameras)
+
+
+def _to_world(transform: ElementTree.Element | None) -> Float64[np.ndarray, "4 4"]:
+    """From a chunk's or component's own axes to the world."""
+    matrix = np.eye(4)
+    if transform is None:
+        return matrix
+    if (rotation := transform.findtext("rotation")) is not None:
+        matrix[:3, :3] = _floats(rotation, 9).reshape(3, 3)
+    if (scale := transform.findtext("scale")) is not None:
+        matrix[:3, :3] *= _floats(scale, 1)
+    if (translation := transform.findtext("translation")) is not None:
+        matrix[:3, 3] = _floats(translation, 3)
+    return matrix
+
+
+def _metashape_lens(sensor: ElementTree.Element) -> dict[str, Any] | None:
+    """Intrinsics as a transforms file has them; None for a sensor that is not calibrated.
+
+    The point (x, y) of a pinhole with z = 1, or for fisheyes that in its direction at the distance of the
+    angle, is seen at f (x', y') + b1 x' + b2 y' + (cx, cy) from the middle of the photo, for
+    x' = x (1 + k1 r^2 + ... + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y, and y' with p1 and p2 exchanged.
+    """
+    found = sensor.findall("calibration")
+    if not found:
+        return None
+    calibration = next((one for one in found if one.get("class") == "adjusted"), found[-1])
+    kind = calibration.get("type") or sensor.get("type") or "frame"
+    size = calibration.find("resolution")
+    size = sensor.find("resolution") if size is None else size
+    if size is None:
+        raise ValueError("a sensor without a resolution")
+    width, height = (float(size.get(name) or "nan") for name in ("width", "height"))
+    if kind in ("spherical", "cylindrical"):
+        return {"camera_model": kind.upper(), "w": width, "h": height, "fl_x": width}
+    if kind not in ("frame", "fisheye"):
+        raise ValueError(f"a sensor of type {short(kind)}")
+
+    def value(name: str) -> float:
+        text = calibration.findtext(name)
+        return 0.0 if text is None else float(_floats(text, 1)[0])
+
+    f = value("f")
+    if not f > 0:
+        raise ValueError("a sensor without a focal length")
+    k1, k2, k3, k4, p1, p2 = map(value, ("k1", "k2", "k3", "k4", "p1", "p2"))
+    lens: dict[str, Any] = {"w": width, "h": height, "fl_x": f + value("b1"), "fl_y": f}
+    lens |= {"cx": width / 2 + value("cx"), "cy": height / 2 + value("cy")}
+    corner = float(np.hypot(width, height) / 2 / f)
+    moved = {"b2": value("b2") * height / 2 / f}
+    if kind == "fisheye":
+        moved |= {name: 3 * f * p * corner**2 for name, p in (("p1", p1), ("p2", p2))}
+        lens |= {"camera_model": "OPENCV_FISHEYE", "k1": k1, "k2": k2, "k3": k3, "k4": k4}
+    else:
+        moved |= {"k4": f * k4 * corner**9}
+        lens |= {"camera_model": "OPENCV", "k1": k1, "k2": k2, "k3": k3, "p1": p2, "p2": p1}  # OpenCV's order
+    for name, pixels in moved.items():
+        if abs(pixels) > _NO_PIXELS:
+            raise ValueError(
+                f"{name} moves a corner by {abs(pixels):.1f} px, and no camera model here has it with a "
+                f"{kind} camera; optimise the cameras without it"
+            )
+    return lens
+
+
+def _floats(text: str, count: int) -> Float64[np.ndarray, " n"]:
+    words = text.split()
+    if len(words) != count:
+        raise ValueError(f"{len(words)} numbers in place of {count}")
+    values = np.array(words, np.float64)
+    if not np.isfinite(values).all():
+        raise ValueError("a number that is not finite")
+    return values
+
+
+def _pictures(folder: Path) -> dict[str, Path]:
+    """The pictures below a folder by name and by stem, in lower case; those of more than one are left out."""
+    found: dict[str, Path | None] = {}
+    for path in sorted(folder.rglob("*")):
+        below = path.relative_to(folder).parts
+        if path.suffix.lower() not in _PICTURES or below[0] in (*FOLDERS, "depth", "confidence"):
+            continue
+        for name in dict.fromkeys((path.name.lower(), path.stem.lower())):
+            found[name] = None if name in found else path
+    return {name: path for name, path in found.items() if path is not None}
+
+
+def _number(file: Path) -> tuple[int, str]:
+    return int(file.stem) if file.stem.isdecimal() and len(file.stem) < 19 else 0, file.stem
+
+
+def _depth_notes(folder: Path, *names: str) -> Iterator[str]:
+    """A line on depth images, if there are some."""
+    depths = [
+        path for name in names for path in (folder / name).glob("*")
+        if name in ("depth", "confidence") or path.suffix.lower() in _DEPTHS
+    ]  # fmt: skip
+    if depths:
+        yield f"{len(depths)} depth images are not used"
+
+
+def _scene(
+    path: Path, file: Path, frames: list[dict[str, Any]], notes: list[str], reading: dict[str, Any]
+) -> Scene:
+    """The scene of frames whose photos are named relative to the folder of `file`."""
+    if not frames:
+        raise SceneError(f"{file}: no camera with a photo; put the photos back where the app wrote them")
+    for frame in frames:
+        if isinstance(frame["file_path"], Path):
+            frame["file_path"] = frame["file_path"].relative_to(file.parent).as_posix()
+    scene = load_transforms(file, content={"frames": frames}, **reading)
+    return replace(scene, name=repaired(path.resolve().name), path=path, notes=(*notes, *scene.notes))
