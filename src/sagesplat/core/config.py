@@ -39,6 +39,11 @@ class SceneConfig:
     vignetting: bool = False
     """Undo the vignetting of the photos: the light that the lens loses towards the corners, estimated from
     points that photos show at different places. Quality is then measured against the corrected photos."""
+    images: Path | None = None
+    """Folder of the photos that poses are for (default: found beside the poses)."""
+    fisheye: Literal["crop", "faces"] = "crop"
+    """Photos of fisheye lenses. crop: what one straight view shows of them; faces: all of them, as the faces
+    of a cube. Photos of 360 degrees always become faces."""
 
 
 @dataclass(frozen=True)

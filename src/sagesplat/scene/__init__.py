@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from sagesplat.core.errors import SceneError
-from sagesplat.scene.detect import CAPTURES, detect
+from sagesplat.scene.detect import CAPTURES, locate
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import read_scene
@@ -19,6 +19,7 @@ __all__ = ["describe", "load_scene"]
 def load_scene(
     path: Path | str, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0,
     alpha: Literal["auto", "background", "ignore"] = "auto", vignetting: bool = False,
+    images: Path | str | None = None, fisheye: Literal["crop", "faces"] = "crop",
 ) -> Scene:  # fmt: skip
     """Load a capture: posed photos and structure-from-motion points.
 
@@ -27,16 +28,18 @@ def load_scene(
     them.
 
     Args:
-        path: Folder of the capture, or its transforms.json.
+        path: Folder of the capture, its transforms.json, or the folder of a COLMAP model.
         downscale: Photos are this many times smaller than the files in images/. Intrinsics follow.
         test_every: Every n-th view by name is a test view; 0: none. A split that the dataset lists is kept.
         calibrate_every: Every n-th of the other views calibrates promises; 0: none, 1 is refused.
         alpha: Transparent pixels of photos. background: of an object that was cut out, composited over the
             background; ignore: pixels that do not count; auto: by their place in the photos.
         vignetting: Estimate it from the photos, which are then read without it (`View.vignetting`).
+        images: Folder of the photos; None: found beside the poses.
+        fisheye: Photos of wide lenses. crop: what a pinhole shows of them; faces: all, as the faces of a cube.
 
     Returns:
-        The scene. Photos themselves are read when they are needed (`scene.images.Photos`). A stored scene is
+        The scene; `Scene.notes` says what was decided while it was read. Photos themselves are read when they are needed (`scene.images.Photos`). A stored scene is
         returned as it was stored, whatever the arguments.
 
     Raises:
@@ -51,12 +54,19 @@ def load_scene(
     path = Path(path)
     if calibrate_every < 0 or calibrate_every == 1:
         raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or >= 2")
-    kind = detect(path)
+    kind, place = locate(path)
     if kind in ("photos", "video"):
         raise SceneError(f"{path}: {kind} without poses; `sagesplat run` finds them")
     if kind == "stored":
         return read_scene(path)
-    scene = CAPTURES[kind].load(path, downscale=downscale, test_every=test_every)
+    images = None if images is None else Path(images)
+    if images is not None and not images.is_dir():
+        raise SceneError(f"{images}: no such folder; give the folder of the photos")
+    scene = CAPTURES[kind].load(
+        place, downscale=downscale, test_every=test_every, images=images, fisheye=fisheye
+    )
+    if place != path:
+        scene = replace(scene, notes=(f"the capture is in {place.name}/", *scene.notes))
     alpha = scene.alpha if alpha == "auto" else alpha
     scene = replace(scene, calibrate_every=calibrate_every, alpha=alpha)
     return with_vignetting(scene, estimate_vignetting(scene, Photos(scene.views))) if vignetting else scene
@@ -77,6 +87,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
         ("name", scene.name),
         ("path", str(scene.path)),
         ("views", f"{len(views)} ({splits})"),
+        *(("read", note) for note in scene.notes),
         ("image size", ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (", ..." if len(sizes) > 3 else "")),
         ("cameras", f"{len(Ks)} distinct intrinsics"),
         (

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
-from sagesplat.scene.colmap import MODEL_FILES, load_colmap
+from sagesplat.scene.colmap import load_colmap
+from sagesplat.scene.find_model import MODEL_FILES, PHOTO_FOLDERS, USUAL, model_folders
+from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTOS, folders_of
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scene import Scene
 
-# Their content decides how they are read (`io.pictures`).
-PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
 VALID_FOLDER = "masks_valid"  # beside photos: masks named like them, black where pixels do not count
 VIDEOS = frozenset(
     {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp"}
@@ -24,41 +24,60 @@ class CaptureFormat:
     """How captures of one format, photos with poses, are recognised and loaded."""
 
     files: tuple[str, ...]  # in the capture's folder: one of them is there
-    load: Callable[..., Scene]  # (path, downscale=, test_every=) -> the scene
+    load: Callable[..., Scene]  # (path, downscale=, test_every=, images=, fisheye=) -> the scene
     suffix: str | None = None  # of other files that stand for a capture
 
 
 CAPTURES = {
-    "colmap": CaptureFormat(MODEL_FILES, load_colmap),
+    "colmap": CaptureFormat(tuple(f"{place}/{name}" for place in USUAL for name in MODEL_FILES), load_colmap),
     "transforms": CaptureFormat(("transforms.json",), load_transforms, suffix=".json"),
     "blender": CaptureFormat(("transforms_train.json",), load_blender),
 }
 
 
 def detect(path: Path) -> str:
-    """The kind of capture at a path: the first of these that matches.
+    """The kind of capture at a path: see `locate`. SceneError if there is none."""
+    return locate(path)[0]
+
+
+def locate(path: Path) -> tuple[str, Path]:
+    """The kind of capture at a path, the first of these that matches, and where it is.
 
     - a name in `CAPTURES`: one of its files is in the folder, or the path is of one, or has its suffix;
+    - colmap: a model is in the folder, or anywhere below it (`find_model`);
+    - a name in `CAPTURES` with a file: in the only folder below that has one, as archives are unpacked;
     - stored: an .npz file, such as the capture of one block (`scene.stored`);
-    - photos: photos in images/, or in the folder itself;
+    - photos: photos in images/, input/, the folder itself, or folders in it;
     - video: the path of a video file.
 
     Raises SceneError if none matches.
     """
     if os.path.isfile(path):  # Path's own methods fail for names that no disk can hold
-        return _of_file(path)
+        return _of_file(path), path
     if not os.path.isdir(path):
         raise SceneError(f"{path}: no such file or folder; give a capture's folder or a video")
-    for kind, capture in CAPTURES.items():
-        if any((path / name).is_file() for name in capture.files):
-            return kind
-    if any(_holds_photos(folder) for folder in (path / "images", path)):
-        return "photos"
+    if kind := _of_folder(path):
+        return kind, path
+    if model_folders(path):
+        return "colmap", path
+    below = folders_of(path)
+    inside = [(kind, each) for each in below if (kind := _of_folder(each))]
+    if len(inside) == 1:
+        return inside[0]
+    photos = [each for each in below if not each.name.lower().startswith(NOT_PHOTOS)]
+    if any(_holds_photos(folder) for folder in (path, *photos)):
+        return "photos", path
     looked_for = ", ".join(name for capture in CAPTURES.values() for name in capture.files)
+    folders = " and ".join(f"{name}/" for name in PHOTO_FOLDERS)
     raise SceneError(
-        f"{path}: no capture (looked for {looked_for}, and photos in images/ and the folder); "
-        "give a folder that has one of them, or a video file"
+        f"{path}: no capture (looked for {looked_for}, other places of cameras.txt, and photos in {folders} and "
+        "the folder); give a folder that has one of them, or a video file"
     )
+
+
+def _of_folder(path: Path) -> str | None:
+    found = (kind for kind, capture in CAPTURES.items() if any((path / n).is_file() for n in capture.files))
+    return next(found, None)
 
 
 def _of_file(path: Path) -> str:

@@ -9,7 +9,7 @@ import os.path
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,15 +20,24 @@ from sagesplat.core.errors import SceneError, short
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import read_json
 from sagesplat.io.typed import convert_as, refused
+from sagesplat.scene.find_photos import Found, PhotoFolder, plain
 from sagesplat.scene.images import has_alpha, photo_size
-from sagesplat.scene.loading import MAX_SIDE, MIN_VIEWS, camera_of, check_settings
+from sagesplat.scene.loading import (
+    MAX_SIDE,
+    MIN_VIEWS,
+    Fisheye,
+    check_found,
+    check_settings,
+    describe_lenses,
+    describe_photos,
+    views_of,
+)
 from sagesplat.scene.points import random_points, read_points
 from sagesplat.scene.scene import Camera, Lens, Scene, View
-from sagesplat.scene.undistort import is_pinhole, pinhole
+from sagesplat.scene.undistort import SPHERE, pinhole
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")  # tried if a file_path has none
 LARGEST = 1e9  # largest number accepted; float32 is too coarse beyond
 MAX_SHEAR = 1e-2  # largest |R^T R - I| that rounding explains
 BLENDER_CUBE = 1.3  # half the side of the cube that NeRF's Blender scenes fit into (3DGS's initial points)
@@ -92,7 +101,9 @@ class _Transforms:
     val_filenames: list[str] | None = None
 
 
-def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+def load_transforms(
+    path: Path, *, downscale: int = 1, test_every: int = 8, images: Path | None = None, fisheye: Fisheye = "crop"
+) -> Scene:
     """The scene of nerfstudio's or instant-ngp's transforms.json; `path` is the file or its folder.
 
     With `downscale` N the photos are read from `images_N/` if the frames are in images/ and that folder
@@ -100,25 +111,32 @@ def load_transforms(path: Path, *, downscale: int = 1, test_every: int = 8) -> S
     the split unless `test_every` is 0: `val` is used only without `test`, and unlisted frames are dropped.
     Points are read from `ply_file_path`, else made by `points.random_points`. They are in the frame of the
     poses: `applied_transform` has been applied to both. A frame's `mask_path` says which pixels count (not
-    black). Depths are not read. Raises SceneError.
+    black). Depths are not read. Photos are found by `find_photos`, in the folder or in `images`; frames whose
+    photo is gone are left out. Raises SceneError.
     """
     file = path if path.suffix == ".json" else path / "transforms.json"
     check_settings(path, downscale, test_every)
     content, frames = _read(file)
-    views = _views(file, frames, downscale)
-    test_names = None
+    by_frame, notes = _views(file, frames, downscale, images, fisheye)
+    views, test_names = [view for _, of_frame in by_frame for view in of_frame], None
     if test_every:
-        views, test_names = _listed_split(file, content, frames, views)
-    views = _sorted(file, views, test_names)
+        views, test_names = _listed_split(file, content, frames, by_frame)
+    ordered = _sorted(file, views, test_names)
     if content.ply_file_path is None:
-        points = random_points(views)
+        points = random_points(ordered)
+        notes.append(f"no points: training begins with {len(points.xyz):,} random ones that cameras see")
     else:
-        points = read_points(file.parent / _inside(file, "ply_file_path", content.ply_file_path))
+        points = read_points(_points_file(file, content.ply_file_path))
     folder = file.parent
-    return Scene(repaired(folder.resolve().name), folder, views, points, test_every, test_names=test_names)
+    return Scene(
+        repaired(folder.resolve().name), folder, ordered, points, test_every, test_names=test_names,
+        notes=(*notes, *describe_lenses(ordered)),
+    )  # fmt: skip
 
 
-def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+def load_blender(
+    path: Path, *, downscale: int = 1, test_every: int = 8, images: Path | None = None, fisheye: Fisheye = "crop"
+) -> Scene:
     """The scene of a NeRF Blender folder: transforms_train.json, and transforms_test.json or else _val.
 
     The train file's views are training views and the test file's are test views, as in 3DGS. With
@@ -131,15 +149,21 @@ def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scen
     tests = next(
         (f for f in (folder / "transforms_test.json", folder / "transforms_val.json") if f.is_file()), None
     )
-    views = _views(train, _read(train)[1], downscale)
-    test_views = _views(tests, _read(tests)[1], downscale) if tests else []
+    by_frame, notes = _views(train, _read(train)[1], downscale, images, fisheye)
+    views, test_views = [view for _, of_frame in by_frame for view in of_frame], []
+    if tests:
+        by_frame, more = _views(tests, _read(tests)[1], downscale, images, fisheye)
+        test_views = [view for _, of_frame in by_frame for view in of_frame]
+        notes = [f"{file.name}: {note}" for file, said in ((train, notes), (tests, more)) for note in said]
     test_names = frozenset(view.name for view in test_views) if tests and test_every else None
-    views = _sorted(train, [*views, *test_views], test_names)
-    if has_alpha(views[0].image_path):
-        views = tuple(replace(view, camera=replace(view.camera, background=WHITE)) for view in views)
-    points = random_points(views, cube=BLENDER_CUBE)
-    name = repaired(folder.resolve().name)
-    return Scene(name, folder, views, points, test_every, test_names=test_names, alpha="background")
+    ordered = _sorted(train, [*views, *test_views], test_names)
+    if has_alpha(ordered[0].image_path):
+        ordered = tuple(replace(view, camera=replace(view.camera, background=WHITE)) for view in ordered)
+    points = random_points(ordered, cube=BLENDER_CUBE)
+    return Scene(
+        repaired(folder.resolve().name), folder, ordered, points, test_every, test_names=test_names,
+        alpha="background", notes=tuple(notes),
+    )  # fmt: skip
 
 
 def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
@@ -149,22 +173,23 @@ def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool]:
     Raises SceneError.
     """
     _, frames = _read(file)
-    found, photos = [], []
-    for number, frame in enumerate(frames):
-        name = frame.file_path or f"{number:03}"
+    names = [_written(file, "file_path", frame.file_path or f"{i:03}") for i, frame in enumerate(frames)]
+    photos = PhotoFolder(file.parent).find(names)
+    found = []
+    for name, frame in zip(names, frames, strict=True):
         try:
-            path = _inside(file, "file_path", name)
-            photos.append(_photo(file.parent, path))
-            if photos[-1] is None and (frame.w is None or frame.h is None):
+            if (photo := photos.files.get(name)) is None and (frame.w is None or frame.h is None):
                 raise ValueError("neither w and h nor its photo")
-            lens = _lens(frame, photos[-1] or file)
+            lens = _lens(frame, file.parent / photo if photo else file)
+            if lens.model == SPHERE:
+                raise ValueError("a photo of 360 degrees is no single view; give the folder with its photos")
             K = pinhole(lens).astype(np.float32)
             w2c = frame.world_to_camera().astype(np.float32)
         except ValueError as error:
             cure = "export the transforms again"
             raise SceneError(f"{file}: frame {short(repr(name))}: {short(error)}; {cure}") from None
         found.append((name, Camera(w2c, K, lens.width, lens.height)))
-    return found, None not in photos
+    return found, not photos.missing
 
 
 def _read(file: Path) -> tuple[_Transforms, list[_Frame]]:
@@ -184,70 +209,75 @@ def _read(file: Path) -> tuple[_Transforms, list[_Frame]]:
     return transforms, frames
 
 
-def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
-    """`value` as a path relative to the file's folder; SceneError if it leads outside."""
-    path = PurePosixPath(value.replace("\\", "/")) if isinstance(value, str) else None
-    if path is None or not path.name or "\0" in path.name:
+def _written(file: Path, key: str, value: Any) -> str:
+    """A path as a transforms file has it; SceneError for one that no photo can have."""
+    name = plain(value) if isinstance(value, str) else ""
+    if not name.strip("/.") or "\0" in name:
         raise SceneError(f"{file}: {key} is {str(value)[:80]!r}; name a file relative to the folder")
-    if path.is_absolute() or ".." in path.parts:
-        raise SceneError(
-            f"{file}: {key} {value[:80]!r} is outside the folder; move it there and name it relative to it"
-        )
     try:
-        check_photo(path.as_posix())
+        check_photo(name.lstrip("/."))
     except ValueError as error:
         raise SceneError(f"{file}: {key} {short(repr(value))}: {error}; rename the file, and here") from None
-    return path
+    return value
 
 
-def _views(file: Path, frames: Sequence[_Frame], downscale: int) -> list[View]:
-    """The views of the frames, in order; names are relative to images/ if all photos are in it."""
-    folder = file.parent
-    paths = [_inside(file, "file_path", frame.file_path) for frame in frames]
-    if all(path.parts[0] == "images" and len(path.parts) > 1 for path in paths):
-        folder, paths = folder / "images", [path.relative_to("images") for path in paths]
-    small = file.parent / f"images_{downscale}"
-    shipped = folder != file.parent and downscale > 1 and small.is_dir()
-    root, divisor = (small, 1) if shipped else (folder, downscale)
-    photos = [_photo(root, path) for path in paths]
-    missing = [path for path, photo in zip(paths, photos, strict=True) if photo is None]
-    if missing:
-        raise SceneError(
-            f"{root}: {len(missing)} of the {len(paths)} photos of {file.name} are missing, first "
-            f"{short(repr(str(missing[0])))}; add the files, or remove their frames"
-        )
-    views = []
-    for frame, path, photo in zip(frames, paths, photos, strict=True):
-        assert photo is not None
+def _points_file(file: Path, value: Any) -> Path:
+    """The file of `ply_file_path`, at the end of the path of another machine, too, but never outside."""
+    parts = [part for part in plain(_written(file, "ply_file_path", value)).split("/") if part not in ("", "..")]
+    places = [file.parent.joinpath(*parts[start:]) for start in range(len(parts))]
+    return next((place for place in places if os.path.isfile(place)), places[0])
+
+
+def _views(
+    file: Path, frames: Sequence[_Frame], downscale: int, images: Path | None, fisheye: Fisheye
+) -> tuple[list[tuple[str, list[View]]], list[str]]:
+    """Of each frame whose photo is there its file_path and its views; and what is to be said about them.
+
+    Names are relative to images/ if all photos are in it.
+    """
+    written = [_written(file, "file_path", frame.file_path) for frame in frames]
+    root = images or file.parent
+    photos = PhotoFolder(root).find(written)
+    check_found(photos, file.name)
+    if images is None and all(name.startswith("images/") for name in photos.files.values()):
+        root = root / "images"
+        files = {name: found.removeprefix("images/") for name, found in photos.files.items()}
+        photos = Found(root, written, files)
+    small, divisor = root.with_name(f"images_{downscale}"), downscale
+    shipped: dict[str, str] = {}
+    if downscale > 1 and root != file.parent and small.is_dir():
+        found = PhotoFolder(small).find(list(photos.files.values()))
+        if found.missing:
+            check_found(Found(small, found.missing, {}), f"{root.name}/")
+        shipped, divisor = found.files, 1
+    masks = _masks(file, frames)
+    by_frame = []
+    for frame, name in zip(frames, written, strict=True):
+        if (below := photos.files.get(name)) is None:
+            continue
+        photo = small / shipped[below] if shipped else root / below
         try:
-            original = (_photo(folder, path) or photo) if shipped else photo
-            lens = _lens(frame, original)
-            K = pinhole(lens)
-            w2c = frame.world_to_camera()
-            valid = _mask(file, frame)
+            lens, w2c = _lens(frame, root / below), frame.world_to_camera()
+            valid = None if frame.mask_path is None else masks[frame.mask_path]
+            views = views_of(below, photo, w2c, lens, divisor, fisheye, valid)
         except ValueError as error:
             reason = short(error)
-            raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
-        camera = camera_of(photo, w2c, lens, K, divisor)
-        name = photo.relative_to(root).as_posix()
-        views.append(View(name, camera, photo, None if is_pinhole(lens) else lens, valid))
-    return views
+            raise SceneError(f"{file}: frame {short(repr(name))}: {reason}; export the transforms again") from None
+        by_frame.append((name, views))
+    return by_frame, describe_photos(photos)
 
 
-def _mask(file: Path, frame: _Frame) -> Path | None:
-    """The image that says which pixels of a frame's photo count. Raises ValueError where it is missing."""
-    if frame.mask_path is None:
-        return None
-    path = file.parent / _inside(file, "mask_path", frame.mask_path)
-    if not path.is_file():
-        raise ValueError(f"no file {short(repr(frame.mask_path))}, its mask_path")
-    return path
-
-
-def _photo(root: Path, path: PurePosixPath) -> Path | None:
-    """A frame's file; Blender scenes leave its suffix out of the file_path."""
-    photos = (root / path.parent / f"{path.name}{suffix}" for suffix in ("", *SUFFIXES))
-    return next((photo for photo in photos if os.path.isfile(photo)), None)  # False for impossible names
+def _masks(file: Path, frames: Sequence[_Frame]) -> dict[str, Path]:
+    """The images that say which pixels of photos count, by mask_path. SceneError where one is missing."""
+    names = [_written(file, "mask_path", f.mask_path) for f in frames if f.mask_path is not None]
+    found = PhotoFolder(file.parent, all_folders=True).find(names)
+    if found.missing:
+        first = short(repr(found.missing[0]))
+        raise SceneError(
+            f"{file}: {len(found.missing)} of {len(names)} masks are missing, first {first}; add the files, or "
+            "remove mask_path"
+        )
+    return {name: file.parent / below for name, below in found.files.items()}
 
 
 def _lens(frame: _Frame, photo: Path) -> Lens:
@@ -318,7 +348,7 @@ def world_to_camera(c2w: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndar
 
 
 def _listed_split(
-    file: Path, content: _Transforms, frames: Sequence[_Frame], views: list[View]
+    file: Path, content: _Transforms, frames: Sequence[_Frame], by_frame: Sequence[tuple[str, list[View]]]
 ) -> tuple[list[View], frozenset[str] | None]:
     """The views that the file's lists name, and the names of the test views (None without lists)."""
     lists = {
@@ -326,21 +356,22 @@ def _listed_split(
         for kind in ("train", "test", "val")
         if (names := getattr(content, f"{kind}_filenames")) is not None
     }
+    views = [view for _, of_frame in by_frame for view in of_frame]
     if not lists:
         return views, None
-    paths = [_inside(file, "file_path", frame.file_path) for frame in frames]
-    name_of = {path: view.name for path, view in zip(paths, views, strict=True)}
+    of_frames = {plain(name): {view.name for view in of_frame} for name, of_frame in by_frame}
+    every = {plain(frame.file_path or "") for frame in frames}
     names: dict[str, set[str]] = {}
     for kind, given in lists.items():
-        listed = [_inside(file, f"{kind}_filenames", path) for path in given]
-        unknown = [path for path in listed if path not in name_of]
+        listed = [plain(_written(file, f"{kind}_filenames", name)) for name in given]
+        unknown = [name for name in listed if name not in every]
         if not listed or unknown:
-            first = f", first {short(repr(str(unknown[0])))}" if unknown else ""
+            first = f", first {short(repr(unknown[0]))}" if unknown else ""
             raise SceneError(
                 f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame{first}; "
                 "list the file_path of frames, or leave the list out"
             )
-        names[kind] = {name_of[path] for path in listed}
+        names[kind] = set().union(*(of_frames.get(name, ()) for name in listed))  # none of a photo that is gone
     every = {view.name for view in views}
     tests = names.get("test") or names.get("val") or every - names["train"]
     train = names.get("train") or every - tests

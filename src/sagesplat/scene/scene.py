@@ -55,6 +55,9 @@ class Camera:
         return self.resized(max(1, round(self.width * share)), max(1, round(self.height * share)))
 
 
+Face = Literal["front", "right", "back", "left", "up", "down"]  # of the cube around a wide lens
+
+
 @dataclass(frozen=True)
 class Lens:
     """A COLMAP camera model with its parameters: `images.load_photo` undistorts photos by it."""
@@ -63,6 +66,7 @@ class Lens:
     params: tuple[float, ...]  # in COLMAP's order, pixels of width x height (the file may be smaller)
     width: int
     height: int
+    face: Face | None = None  # the view shows this face of the cube around the lens; None: straight ahead
 
 
 STEEPEST = 10.0  # magnitude of a coefficient of a vignetting
@@ -121,6 +125,7 @@ class Scene:
     test_names: frozenset[str] | None = None  # overrides test_every: test views that the data set lists
     calibration_names: frozenset[str] | None = None  # likewise overrides calibrate_every
     alpha: Literal["auto", "background", "ignore"] = "auto"  # what transparent pixels mean (`SceneConfig`)
+    notes: tuple[str, ...] = ()  # what was decided while it was read, a line each
 
     @cached_property
     def extent(self) -> float:
