@@ -36,11 +36,12 @@ def load_scene(
             background; ignore: pixels that do not count; auto: by their place in the photos.
         vignetting: Estimate it from the photos, which are then read without it (`View.vignetting`).
         images: Folder of the photos; None: found beside the poses.
-        fisheye: Photos of wide lenses. crop: what a pinhole shows of them; faces: all, as the faces of a cube.
+        fisheye: Photos of wide lenses. crop: what a pinhole shows of them; faces: all, as a cube's faces.
 
     Returns:
-        The scene; `Scene.notes` says what was decided while it was read. Photos themselves are read when they are needed (`scene.images.Photos`). A stored scene is
-        returned as it was stored, whatever the arguments.
+        The scene; `Scene.notes` says what was decided while it was read. Photos themselves are read when they
+        are needed (`scene.images.Photos`). A stored scene is returned as it was stored, whatever the
+        arguments.
 
     Raises:
         SceneError: If nothing at `path` is a capture, a file of it is damaged, or an argument is impossible.

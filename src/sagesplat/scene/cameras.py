@@ -36,13 +36,14 @@ class NamedCamera:
     photo: View | None = None  # `scene.images` reads it
 
 
-def read_camera_file(path: Path) -> list[NamedCamera]:
+def read_camera_file(path: Path, images: Path | None = None) -> list[NamedCamera]:
     """The cameras of a file or a capture, in its order.
 
     Args:
         path: cameras.json as 3DGS writes it (camera to world, OpenCV axes), viewpoints.json of a run,
             transforms.json, or a folder with a COLMAP workspace, nerfstudio's transforms or such a
             cameras.json. A transforms.json without its photos is read for its poses and intrinsics.
+        images: folder of a capture's photos; None: found beside the poses.
 
     Returns:
         At least one camera; those of captures with their photos.
@@ -54,10 +55,10 @@ def read_camera_file(path: Path) -> list[NamedCamera]:
     if path.is_dir() and (path / "cameras.json").is_file():
         path = path / "cameras.json"
     if path.is_dir() or path.suffix != ".json":
-        return _of_capture(path)
+        return _of_capture(path, images)
     document = read_json(path, _CURE)
     if isinstance(document, dict) and document.get("format") != VIEWPOINTS:
-        return _of_transforms(path)
+        return _of_transforms(path, images)
     with refused(path, "a list of cameras", _CURE):
         if isinstance(document, list):
             entries = convert_as(document, list[_Of3dgs])
@@ -70,15 +71,16 @@ def read_camera_file(path: Path) -> list[NamedCamera]:
     return found
 
 
-def _of_capture(path: Path) -> list[NamedCamera]:
-    return [NamedCamera(repaired(v.name), v.camera, v) for v in load_scene(path, test_every=0).views]
+def _of_capture(path: Path, images: Path | None) -> list[NamedCamera]:
+    views = load_scene(path, test_every=0, images=images).views
+    return [NamedCamera(repaired(view.name), view.camera, view) for view in views]
 
 
-def _of_transforms(path: Path) -> list[NamedCamera]:
+def _of_transforms(path: Path, images: Path | None) -> list[NamedCamera]:
     """Of a transforms.json: with its photos if they are there."""
     cameras, complete = frame_cameras(path)
-    if complete:
-        return _of_capture(path)
+    if complete or images is not None:
+        return _of_capture(path, images)
     return [NamedCamera(repaired(name), _within_limits(camera)) for name, camera in cameras]
 
 

@@ -26,16 +26,22 @@ from sagesplat.scene.undistort import FACES, SPHERE, distort, intrinsics
 
 POINT_FILES = ("points3D.ply", "points3d.ply", "points.ply", "sparse.ply", "sparse_pc.ply", "point_cloud.ply")
 
+
 def load_colmap(
-    path: Path, *, downscale: int = 1, test_every: int = 8, images: Path | None = None, fisheye: Fisheye = "crop"
+    path: Path,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    images: Path | None = None,
+    fisheye: Fisheye = "crop",
 ) -> Scene:
     """The scene of a COLMAP workspace: a model, usually in `sparse/0`, and its photos, usually in `images/`.
 
-    Both are looked for (`find_model`); `path` may be the folder of a model, too. Photos of the model that are
-    gone are left out. With `downscale` N the photos are read from `images_N/` if that folder exists. Otherwise
-    they are area-resampled. Distorted cameras are replaced by pinholes (`undistort.pinhole`), or by the faces
-    of a cube, and their observations are undistorted. Observations outside the image are dropped. Without
-    points, there are random ones. Raises SceneError.
+    Both are looked for (`find_model`); `path` may be the folder of a model, too. Photos of the model that
+    are gone are left out. With `downscale` N the photos are read from `images_N/` if that folder exists.
+    Otherwise they are area-resampled. Distorted cameras are replaced by pinholes (`undistort.pinhole`), or
+    by the faces of a cube, and their observations are undistorted. Observations outside the image are
+    dropped. Without points, there are random ones. Raises SceneError.
     """
     check_settings(path, downscale, test_every)
     chosen, notes = find_model(path, images)
@@ -150,8 +156,9 @@ def _scene_points(
             ideal = rays * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
             error = uv - distort(view.lens, rays) * scale
             if view.lens.face is not None:
-                turn = [view.lens.width if view.lens.model == SPHERE else np.inf, np.inf]
-                error = np.where(np.abs(error) < np.divide(turn, 2), error, 0)  # none beyond the sphere's seam
+                if view.lens.model == SPHERE:  # its left side follows the right one
+                    turn = view.lens.params[0]
+                    error[:, 0] = (error[:, 0] + turn / 2) % turn - turn / 2
                 error *= camera.K[0, 0] / intrinsics(view.lens)[0, 0]
             uv = ideal + error
         uv = uv.astype(np.float32)

@@ -43,9 +43,9 @@ def read_names(folder: Path) -> list[str]:
 def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], ModelPoints | None]:
     """Cameras by id, posed images and points of the model in `folder`; binary files are preferred to text.
 
-    None for points where there is no points3D.bin or .txt, as other tools leave it out. SceneError for missing
-    or damaged files. All numbers are finite, but not checked further. Memory stays within a small multiple of
-    the file sizes: the counts in the files are not trusted.
+    None for points where there is no points3D.bin or .txt, as other tools leave it out. SceneError for
+    missing or damaged files. All numbers are finite, but not checked further. Memory stays within a small
+    multiple of the file sizes: the counts in the files are not trusted.
     """
     cameras = _read(folder, "cameras", _binary_cameras, _text_cameras)
     listed = _read(folder, "images", _binary_images, _text_images)

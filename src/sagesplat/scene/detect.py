@@ -70,8 +70,8 @@ def locate(path: Path) -> tuple[str, Path]:
     looked_for = ", ".join(name for capture in CAPTURES.values() for name in capture.files)
     folders = " and ".join(f"{name}/" for name in PHOTO_FOLDERS)
     raise SceneError(
-        f"{path}: no capture (looked for {looked_for}, other places of cameras.txt, and photos in {folders} and "
-        "the folder); give a folder that has one of them, or a video file"
+        f"{path}: no capture (looked for {looked_for}, other places of cameras.txt, and photos in {folders} "
+        "and the folder); give a folder that has one of them, or a video file"
     )
 
 

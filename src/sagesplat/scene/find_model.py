@@ -53,8 +53,8 @@ def find_model(path: Path, images: Path | None = None) -> tuple[FoundModel, list
     folders = model_folders(path)
     if not folders:
         raise SceneError(
-            f"{path}: no COLMAP model (looked for {' and '.join(MODEL_FILES)} in sparse/0, sparse, the folder "
-            f"itself and those below); run COLMAP on the photos first, or give the folder that holds them"
+            f"{path}: no COLMAP model (looked for {' and '.join(MODEL_FILES)} in it and below it); "
+            "run COLMAP on the photos first, or give the folder that holds them"
         )
     found: list[FoundModel] = []
     damaged: list[Path] = []
@@ -76,12 +76,14 @@ def find_model(path: Path, images: Path | None = None) -> tuple[FoundModel, list
 def _describe(path: Path, best: FoundModel, others: dict[Path, str]) -> list[str]:
     below = best.folder.relative_to(path).as_posix()
     if not others:
-        return [] if below in USUAL else [f"poses are those of {'the folder itself' if below == '.' else below}"]
+        return (
+            [] if below in USUAL else [f"poses are those of {'the folder itself' if below == '.' else below}"]
+        )
     rest = [f"{short(folder.relative_to(path).as_posix())} ({what})" for folder, what in others.items()]
     more = f" and {len(rest) - 3} more" if len(rest) > 3 else ""
     return [
-        f"poses are those of {short(below)}, of {len(others) + 1} models the one with the most photos; left aside: "
-        f"{', '.join(rest[:3])}{more} (to take another one, give its folder)"
+        f"poses: those of {short(below)}, which of {len(others) + 1} models has the most photos; left aside: "
+        f"{', '.join(rest[:3])}{more}; to take another one, give its folder"
     ]
 
 
@@ -91,7 +93,9 @@ def _holds_model(folder: Path) -> bool:
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
     """Folders below, nearer ones first, that are not full of pictures."""
-    below = [each for each in folders_of(folder) if not each.name.lower().startswith((*PHOTO_FOLDERS, "mask"))]
+    below = [
+        each for each in folders_of(folder) if not each.name.lower().startswith((*PHOTO_FOLDERS, "mask"))
+    ]
     if (folder / "poses.json").is_file():
         below = [each for each in below if each.name != "sfm"]  # intermediate results of ours
     yield from below

@@ -16,7 +16,9 @@ from sagesplat.core.names import check_photo, collision_key
 
 # Their content decides how they are read (`io.pictures`).
 PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
-_RAW = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gpr"})  # exported as others
+_RAW = frozenset(
+    {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gpr"}
+)  # exported as others
 _DEEPEST, _MOST = 8, 10**5  # folders below each other, and in all
 # Folders beside photos begin so: of smaller copies, masks, depths.
 NOT_PHOTOS = ("images_", "mask", "depth", "normal", "semantic", "sparse", "distorted", "confidence", "thumb")
@@ -30,6 +32,7 @@ class Found:
     folder: Path
     names: Sequence[str]  # as written
     files: dict[str, str]  # name as written -> path below the folder, as on the disk
+    prefix: str = ""  # of all names: folders above the folder
 
     @property
     def missing(self) -> list[str]:
@@ -39,7 +42,9 @@ class Found:
     @cached_property
     def written_differently(self) -> str:
         """One line on the names that are not those of the files; empty where all are."""
-        changed = [(name, file) for name, file in self.files.items() if plain(name) != file]
+        changed = [
+            (name, file) for name, file in self.files.items() if name.removeprefix("./") != self.prefix + file
+        ]
         if not changed:
             return ""
         name, file = changed[0]
@@ -60,10 +65,10 @@ class PhotoFolder:
     def find(self, names: Sequence[str]) -> Found:
         """The files that the names mean.
 
-        A name is taken as it is, where there is such a file. Others are compared without regard to case, form
-        of Unicode, separators and `..`; then with another suffix of a picture; then by as many folders as both
-        have at the end; last by the name alone, in folders of which no photo is known. A file that two names
-        would mean, and a name that would mean two files, are not matched.
+        A name is taken as it is, where there is such a file. Others are compared without regard to case,
+        form of Unicode, separators and `..`; then with another suffix of a picture; then by as many folders
+        as both have at the end; last by the name alone, in folders of which no photo is known. A file that
+        two names would mean, and a name that would mean two files, are not matched.
         """
         found = {name: file for name in dict.fromkeys(names) if (file := self._exact(name)) is not None}
         rest = [name for name in dict.fromkeys(names) if name not in found]
@@ -108,7 +113,7 @@ class PhotoFolder:
 
     @cached_property
     def files(self) -> "list[_Name]":
-        """All photos below the folder, without hidden ones and folders of masks, depths and smaller copies."""
+        """Photos below the folder, without hidden ones and folders of masks, depths and smaller copies."""
         return [_Name.of(name) for name in sorted(_walk(self.folder, "", 0, self._skipped, set()))]
 
 

@@ -55,7 +55,9 @@ def describe_photos(photos: Found) -> list[str]:
     lines = [f"{len(photos.files)} of {max(total, len(photos.files))} photos have poses"]
     if missing := photos.missing:
         first = short(repr(missing[0]))
-        lines.append(f"{len(missing)} of {len(photos.names)} posed photos are gone and left out, first {first}")
+        lines.append(
+            f"{len(missing)} of {len(photos.names)} posed photos are gone and left out, first {first}"
+        )
     if changed := photos.written_differently:
         lines.append(changed)
     return lines
@@ -70,7 +72,7 @@ def describe_lenses(views: Sequence[View]) -> list[str]:
             across, down = np.rad2deg(2 * np.arctan([lens.width, lens.height] / K[[0, 1], [0, 1]] / 2))
             keep = "; --fisheye faces keeps it" if len(cube_faces(lens)) > 1 else ""
             lines.append(
-                f"{lens.model}: the views show {across:.0f} x {down:.0f} degrees, {cropped:.0%} of the photos "
+                f"{lens.model}: the views show {across:.0f} x {down:.0f} degrees, {cropped:.0%} of the photo "
                 f"is cropped{keep}"
             )
     faces = [view.lens for view in views if view.lens and view.lens.face]
@@ -80,7 +82,9 @@ def describe_lenses(views: Sequence[View]) -> list[str]:
     spheres = {lens for lens in faces if lens.model == SPHERE and lens.width != 2 * lens.height}
     if spheres:
         one = next(iter(spheres))
-        lines.append(f"photos of {one.width} x {one.height} px are taken as 360 x 180 degrees, though not 2:1")
+        lines.append(
+            f"photos of {one.width} x {one.height} px are taken as 360 x 180 degrees, though not 2:1"
+        )
     return lines[:4]
 
 
@@ -101,7 +105,9 @@ def views_of(
     focal = intrinsics(lens)[0, 0] * width / lens.width / divisor  # as sharp as in the middle of the photo
     side = max(1, round(2 * focal))
     if side > MAX_SIDE:
-        raise ValueError(f"{lens.model}: focal length {lens.params[0]:g} of {lens.width} px is no wide lens's")
+        raise ValueError(
+            f"{lens.model}: focal length {lens.params[0]:g} of {lens.width} px is no wide lens's"
+        )
     K = np.array([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1]], np.float32)
     path, views = PurePosixPath(name), []
     for face in cube_faces(lens):

@@ -36,14 +36,21 @@ from sagesplat.scene.points import random_points, read_points
 from sagesplat.scene.scene import Camera, Lens, Scene, View
 from sagesplat.scene.undistort import SPHERE, pinhole
 
-PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-FISHEYE = "OPENCV_FISHEYE"
+# Camera models by the names that nerfstudio, its converters and instant-ngp give them. What they mean is told
+# by the coefficients: of the perspective ones k1 ... k3, p1, p2, of the fisheye ones k1 ... k4.
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+ARIA = "FISHEYE624"  # of Project Aria, with distortion_params: COLMAP's RAD_TAN_THIN_PRISM_FISHEYE
+SPHERES = (SPHERE, "SPHERICAL")
+NO_PIXELS = 1e-2  # what a coefficient may move the corners of a photo by, to be taken for zero
 LARGEST = 1e9  # largest number accepted; float32 is too coarse beyond
+SMALLEST = 1e-6  # scale of a camera
 MAX_SHEAR = 1e-2  # largest |R^T R - I| that rounding explains
 BLENDER_CUBE = 1.3  # half the side of the cube that NeRF's Blender scenes fit into (3DGS's initial points)
 WHITE = (255, 255, 255)
 _CURE = "give a folder with a complete transforms file"
-_Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)] | None
+_Given = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+_Number = _Given | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +95,7 @@ class _Frame(Pose):
     k4: _Number = None
     p1: _Number = None
     p2: _Number = None
+    distortion_params: Annotated[list[_Given], Meta(max_length=100)] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +110,12 @@ class _Transforms:
 
 
 def load_transforms(
-    path: Path, *, downscale: int = 1, test_every: int = 8, images: Path | None = None, fisheye: Fisheye = "crop"
+    path: Path,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    images: Path | None = None,
+    fisheye: Fisheye = "crop",
 ) -> Scene:
     """The scene of nerfstudio's or instant-ngp's transforms.json; `path` is the file or its folder.
 
@@ -135,7 +148,12 @@ def load_transforms(
 
 
 def load_blender(
-    path: Path, *, downscale: int = 1, test_every: int = 8, images: Path | None = None, fisheye: Fisheye = "crop"
+    path: Path,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    images: Path | None = None,
+    fisheye: Fisheye = "crop",
 ) -> Scene:
     """The scene of a NeRF Blender folder: transforms_train.json, and transforms_test.json or else _val.
 
@@ -223,7 +241,9 @@ def _written(file: Path, key: str, value: Any) -> str:
 
 def _points_file(file: Path, value: Any) -> Path:
     """The file of `ply_file_path`, at the end of the path of another machine, too, but never outside."""
-    parts = [part for part in plain(_written(file, "ply_file_path", value)).split("/") if part not in ("", "..")]
+    parts = [
+        part for part in plain(_written(file, "ply_file_path", value)).split("/") if part not in ("", "..")
+    ]
     places = [file.parent.joinpath(*parts[start:]) for start in range(len(parts))]
     return next((place for place in places if os.path.isfile(place)), places[0])
 
@@ -242,7 +262,7 @@ def _views(
     if images is None and all(name.startswith("images/") for name in photos.files.values()):
         root = root / "images"
         files = {name: found.removeprefix("images/") for name, found in photos.files.items()}
-        photos = Found(root, written, files)
+        photos = Found(root, written, files, prefix="images/")
     small, divisor = root.with_name(f"images_{downscale}"), downscale
     shipped: dict[str, str] = {}
     if downscale > 1 and root != file.parent and small.is_dir():
@@ -251,7 +271,8 @@ def _views(
             check_found(Found(small, found.missing, {}), f"{root.name}/")
         shipped, divisor = found.files, 1
     masks = _masks(file, frames)
-    by_frame = []
+    by_frame: list[tuple[str, list[View]]] = []
+    scales: list[float] = []
     for frame, name in zip(frames, written, strict=True):
         if (below := photos.files.get(name)) is None:
             continue
@@ -262,9 +283,16 @@ def _views(
             views = views_of(below, photo, w2c, lens, divisor, fisheye, valid)
         except ValueError as error:
             reason = short(error)
-            raise SceneError(f"{file}: frame {short(repr(name))}: {reason}; export the transforms again") from None
+            raise SceneError(
+                f"{file}: frame {short(repr(name))}: {reason}; export the transforms again"
+            ) from None
         by_frame.append((name, views))
-    return by_frame, describe_photos(photos)
+        if frame.transform_matrix is not None:
+            scales.append(float(np.linalg.norm(frame.transform_matrix[:3, 0])))
+    notes = describe_photos(photos)
+    if np.abs(np.subtract(scales, 1)).max() > MAX_SHEAR:
+        notes.append(f"the axes of the poses are {np.median(scales):.3g} long; their scale is left out")
+    return by_frame, notes
 
 
 def _masks(file: Path, frames: Sequence[_Frame]) -> dict[str, Path]:
@@ -274,8 +302,8 @@ def _masks(file: Path, frames: Sequence[_Frame]) -> dict[str, Path]:
     if found.missing:
         first = short(repr(found.missing[0]))
         raise SceneError(
-            f"{file}: {len(found.missing)} of {len(names)} masks are missing, first {first}; add the files, or "
-            "remove mask_path"
+            f"{file}: {len(found.missing)} of {len(names)} masks are missing, first {first}; add the files, "
+            "or remove mask_path"
         )
     return {name: file.parent / below for name, below in found.files.items()}
 
@@ -284,31 +312,38 @@ def _lens(frame: _Frame, photo: Path) -> Lens:
     """A frame's lens as a COLMAP camera model; `photo` gives the size if the frame does not.
 
     With k3, OPENCV becomes COLMAP's FULL_OPENCV. k4 is accepted for the fisheye only, since other models
-    define it differently. Raises ValueError.
+    define it differently; one that moves no pixel is none. Raises ValueError.
     """
-    model = frame.camera_model or (FISHEYE if frame.is_fisheye else "OPENCV")
-    if model not in (*PERSPECTIVE, FISHEYE):
-        known = ", ".join((*PERSPECTIVE, FISHEYE))
-        raise ValueError(f"camera_model {model[:40]!r} is not one of {known}")
+    model = (frame.camera_model or (FISHEYE[0] if frame.is_fisheye else "OPENCV")).upper()
+    if model not in (*PERSPECTIVE, *FISHEYE, *SPHERES, ARIA):
+        known = ", ".join((*PERSPECTIVE, *FISHEYE, ARIA, SPHERE))
+        raise ValueError(f"camera_model {short(repr(model))} is not one of {known}")
     if frame.w is None or frame.h is None:
         width, height = photo_size(photo)
     else:
         width, height = round(frame.w), round(frame.h)
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise ValueError(f"size {width} x {height} is out of range")
+    if model in SPHERES:  # the photo is the whole sphere, whatever its focal length is said to be
+        return Lens(SPHERE, (float(width), float(height)), width, height)
     fx = _focal(frame.fl_x, frame.camera_angle_x, width)
     fy = _focal(frame.fl_y, frame.camera_angle_y, height)
     fx, fy = fx or fy, fy or fx
     if fx is None or fy is None:
         raise ValueError("neither fl_x nor camera_angle_x")
     cx, cy = (width / 2 if frame.cx is None else frame.cx), (height / 2 if frame.cy is None else frame.cy)
+    params = (fx, fy, cx, cy)
+    if model == ARIA:
+        if len(given := frame.distortion_params or ()) != 12:
+            raise ValueError(f"{ARIA} has 12 distortion_params, not {len(given)}")
+        return Lens("RAD_TAN_THIN_PRISM_FISHEYE", (*params, *given), width, height)
     given = (frame.k1, frame.k2, frame.k3, frame.k4, frame.p1, frame.p2)
     k1, k2, k3, k4, p1, p2 = (0.0 if value is None else value for value in given)
-    params = (fx, fy, cx, cy)
-    if model == FISHEYE and not (p1 or p2):
-        return Lens(FISHEYE, (*params, k1, k2, k3, k4), width, height)
-    if model == FISHEYE or k4:
-        raise ValueError(f"{model} has no {'p1 and p2' if model == FISHEYE else 'k4'}")
+    if model in FISHEYE and not (p1 or p2):
+        return Lens(FISHEYE[0], (*params, k1, k2, k3, k4), width, height)
+    corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
+    if model in FISHEYE or abs(k4) * corner**9 * max(fx, fy) > NO_PIXELS:
+        raise ValueError(f"{model} has no {'p1 and p2' if model in FISHEYE else 'k4'}")
     if k3:
         return Lens("FULL_OPENCV", (*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), width, height)
     return Lens("OPENCV", (*params, k1, k2, p1, p2), width, height)
@@ -334,9 +369,13 @@ def world_to_camera(c2w: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndar
     if len(c2w) == 4 and np.abs(c2w[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise ValueError("the last row of transform_matrix is not 0 0 0 1 (is it transposed?)")
     axes = c2w[:3, :3]
+    length = np.sqrt(
+        (axes * axes).sum() / 3
+    )  # of all three: the scale of the camera's node, which turns nothing
+    axes = axes / (length if length > SMALLEST else 1)
     shear = np.abs(axes.T @ axes - np.eye(3)).max()
     if shear > MAX_SHEAR:
-        lengths = ", ".join(f"{length:.3g}" for length in np.linalg.norm(axes, axis=0))
+        lengths = ", ".join(f"{each:.3g}" for each in np.linalg.norm(c2w[:3, :3], axis=0))
         raise ValueError(f"transform_matrix is no rotation (axes {lengths} long); apply the camera's scale")
     if np.linalg.det(axes) < 0:
         raise ValueError("transform_matrix is a reflection (left-handed axes)")
@@ -371,7 +410,9 @@ def _listed_split(
                 f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame{first}; "
                 "list the file_path of frames, or leave the list out"
             )
-        names[kind] = set().union(*(of_frames.get(name, ()) for name in listed))  # none of a photo that is gone
+        names[kind] = set().union(
+            *(of_frames.get(name, ()) for name in listed)
+        )  # none of a photo that is gone
     every = {view.name for view in views}
     tests = names.get("test") or names.get("val") or every - names["train"]
     train = names.get("train") or every - tests

@@ -1,8 +1,8 @@
 """COLMAP's camera models, and undistortion to a pinhole camera.
 
 Implemented from the definitions in COLMAP's documentation (https://colmap.github.io/cameras.html) and in
-Kannala & Brandt 2006 (fisheye), Devernay & Faugeras 2001 (FOV), Weng et al. 1992 (thin prism), Fitzgibbon 2001
-(division), Khomutenko et al. 2016 (EUCM), Engel et al. 2023 (RAD_TAN_THIN_PRISM_FISHEYE: Project Aria).
+Kannala & Brandt 2006 (fisheye), Devernay & Faugeras 2001 (FOV), Weng et al. 1992 (thin prism), Fitzgibbon
+2001 (division), Khomutenko et al. 2016 (EUCM), Engel et al. 2023 (RAD_TAN_THIN_PRISM_FISHEYE: Project Aria).
 """
 
 from dataclasses import replace
@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Shaped
+from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import map_coordinates
 
 from sagesplat.scene.scene import Camera, Face, Lens
@@ -54,7 +54,9 @@ CAMERA_MODELS = {
     "EQUIRECTANGULAR": CameraModel(17, 0, 0),  # width and height of the whole sphere, pixels
 }
 SPHERE = "EQUIRECTANGULAR"
-WIDE = frozenset({name for name in CAMERA_MODELS if "FISHEYE" in name} | {"SIMPLE_DIVISION", "DIVISION", "EUCM"})
+WIDE = frozenset(
+    {name for name in CAMERA_MODELS if "FISHEYE" in name} | {"SIMPLE_DIVISION", "DIVISION", "EUCM"}
+)
 # Axes of a cube's face in those of the lens: columns are x right, y down, z out of the face.
 FACES: dict[Face, Float[np.ndarray, "3 3"]] = {
     "front": np.eye(3),
@@ -226,9 +228,7 @@ def cube_faces(lens: Lens) -> tuple[Face, ...]:
     return tuple(face for face in FACES if seen(replace(lens, face=face), K, 32, 32).mean() >= 0.02)
 
 
-def seen(
-    lens: Lens, K: Float[np.ndarray, "3 3"], width: int, height: int
-) -> Bool[np.ndarray, "{height} {width}"]:
+def seen(lens: Lens, K: Float[np.ndarray, "3 3"], width: int, height: int) -> Bool[np.ndarray, "H W"]:
     """Which pixels of a face, with the intrinsics K, the photo shows."""
     rays = _rays(K, width, height)
     with np.errstate(all="ignore"):  # a damaged lens overflows, and shows nothing then
@@ -262,7 +262,7 @@ def _reach(lens: Lens) -> float:
     return min(falls, max(across, _FARTHEST))
 
 
-def _rays(K: Float[np.ndarray, "3 3"], width: int, height: int) -> Float32[np.ndarray, "{height} {width} 2"]:
+def _rays(K: Float[np.ndarray, "3 3"], width: int, height: int) -> Float[np.ndarray, "H W 2"]:
     """x / z and y / z of the pixels of a pinhole camera."""
     u = (np.arange(width, dtype=np.float32) + 0.5 - K[0, 2]) / K[0, 0]
     v = (np.arange(height, dtype=np.float32) + 0.5 - K[1, 2]) / K[1, 1]

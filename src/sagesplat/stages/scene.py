@@ -66,18 +66,24 @@ def open_scene(
     run = job.run
     check_folder(run)
     if detect(path) in ("photos", "video"):
+        if config.images is not None:
+            raise RunError(
+                f"{path}: no poses for the photos of --images; give the folder that has them, or leave out "
+                "--images"
+            )
         capture = run.capture / repaired(path.resolve().stem)  # the scene will have that name
         leaving_out = _LeavingOut(config, masks or MasksConfig(), labels or LabelsConfig())
         _find_poses(job, path, capture, poses or PosesConfig(), leaving_out)
         path = capture
     begun = _begun(job)
     if not config.downscale:
-        config = replace(config, downscale=_downscale(job, path, begun))
-    same = begun and not job.force and begun.settings == asdict(config)
+        config = replace(config, downscale=_downscale(job, path, config, begun))
+    reads = reading(config)
+    same = begun and not job.force and begun.settings == reads
     again = begun and same and begun.path == path.resolve()  # what was found in the photos is known
-    scene = begun.load() if begun and again else load_scene(path, **asdict(config))
+    scene = begun.load() if begun and again else load_scene(path, **reads)
     photos, found = photo_hashes(run.photo_hashes, scene), scene.views[0].vignetting
-    settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
+    settings = {"path": str(path.resolve()), **reads, "fingerprint": fingerprint(scene)}
     settings["photos"] = photos.digest
     if begun and same:
         check_photos(scene, begun.photos, photos.sha256)
@@ -87,7 +93,7 @@ def open_scene(
             run.scene,
             {
                 "path": str(path.resolve()),
-                "settings": asdict(config),
+                "settings": reads,
                 "fingerprint": settings["fingerprint"],
                 "photos": photos.sha256,
                 "vignetting": found and asdict(found),
@@ -111,6 +117,7 @@ def open_scene(
         lines = [
             f"{len(scene.train_ids)} training, {len(scene.test_ids)} test views, {size.width}x{size.height}",
             f"{len(scene.points.xyz):,} points",
+            *scene.notes,
         ]
         if config.vignetting:
             lines.append(_of_lens(found))
@@ -120,13 +127,20 @@ def open_scene(
     photos.keep()
 
 
-def _downscale(job: Job, path: Path, begun: Capture | None) -> int:
+def reading(config: SceneConfig) -> dict[str, Any]:
+    """How a capture is read, as records hold it: `load_scene` takes it."""
+    images = config.images and str(config.images.resolve())
+    return {**asdict(config), "images": images}
+
+
+def _downscale(job: Job, path: Path, config: SceneConfig, begun: Capture | None) -> int:
     """The factor for a capture where none was asked for: that of the run, or what the machine can do."""
     if begun and "downscale" in begun.settings:
         return int(begun.settings["downscale"])
     if "cuda" in (job.backend, job.executor.backend) or detect(path) == "stored":
         return 1
-    cameras = [view.camera for view in load_scene(path).views]
+    as_it_is = replace(config, downscale=1, vignetting=False)
+    cameras = [view.camera for view in load_scene(path, **reading(as_it_is)).views]
     factor = cpu_downscale(float(np.median([camera.width * camera.height for camera in cameras])))
     if factor > 1:
         size = f"{cameras[0].width} x {cameras[0].height}"
