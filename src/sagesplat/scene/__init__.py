@@ -70,6 +70,9 @@ def load_scene(
         scene = replace(scene, notes=(f"the capture is in {place.name}/", *scene.notes))
     alpha = scene.alpha if alpha == "auto" else alpha
     scene = replace(scene, calibrate_every=calibrate_every, alpha=alpha)
+    if vignetting and any(view.lens and view.lens.face for view in scene.views):
+        no = "vignetting is not undone in faces of cubes"  # it would be that of the whole photo
+        return replace(scene, notes=(*scene.notes, no))
     return with_vignetting(scene, estimate_vignetting(scene, Photos(scene.views))) if vignetting else scene
 
 

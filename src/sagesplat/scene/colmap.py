@@ -9,7 +9,7 @@ from sagesplat.core.errors import SceneError, short
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
-from sagesplat.scene.find_model import FoundModel, find_model
+from sagesplat.scene.find_model import PHOTO_FOLDERS, FoundModel, find_model
 from sagesplat.scene.find_photos import PhotoFolder, plain
 from sagesplat.scene.loading import (
     MIN_VIEWS,
@@ -65,8 +65,15 @@ def load_colmap(
         if tracked is None:
             tracked, more = _points_beside(path, chosen.folder, views)
             notes.append(more)
-    name = repaired(path.resolve().name)
-    return Scene(name, path, views, tracked, test_every, notes=tuple(notes))
+    home = _home(path, chosen.photos.folder)
+    name = repaired((home if home.absolute() in path.absolute().parents else path).resolve().name)
+    return Scene(name, home, views, tracked, test_every, notes=tuple(notes))
+
+
+def _home(path: Path, photos: Path) -> Path:
+    """The folder that may have masks: the one that was given, or else the one that holds the photos."""
+    beside = photos.parent if photos.name in PHOTO_FOLDERS else path
+    return path if any((path / name).is_dir() for name in ("images", "masks", "masks_valid")) else beside
 
 
 def _there(chosen: FoundModel, listed: Sequence[ModelImage]) -> list[ModelImage]:

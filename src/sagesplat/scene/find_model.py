@@ -76,9 +76,7 @@ def find_model(path: Path, images: Path | None = None) -> tuple[FoundModel, list
 def _describe(path: Path, best: FoundModel, others: dict[Path, str]) -> list[str]:
     below = best.folder.relative_to(path).as_posix()
     if not others:
-        return (
-            [] if below in USUAL else [f"poses are those of {'the folder itself' if below == '.' else below}"]
-        )
+        return [] if below in USUAL else [f"poses: those of {'the folder itself' if below == '.' else below}"]
     rest = [f"{short(folder.relative_to(path).as_posix())} ({what})" for folder, what in others.items()]
     more = f" and {len(rest) - 3} more" if len(rest) > 3 else ""
     return [
@@ -105,35 +103,36 @@ def _walk(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def _photos(path: Path, folder: Path, names: list[str], images: Path | None) -> Found:
-    """The photos of a model: in the first folder that has half of them, else in that which has most."""
+    """The photos of a model: in the first usual folder that has half of them, else in that which has most."""
     if images is not None:
         return PhotoFolder(images).find(names)
     best = PhotoFolder(path / PHOTO_FOLDERS[0]).find(names)
-    for place in _places(path, folder):
-        found = PhotoFolder(place).find(names)
-        if 2 * len(found.files) >= len(names) > 0:
-            return found
-        best = max(best, found, key=lambda one: len(one.files))
+    for places in _places(path, folder):
+        for place in places:
+            found = PhotoFolder(place).find(names)
+            best = max(best, found, key=lambda one: len(one.files))
+            if place.name in PHOTO_FOLDERS and 2 * len(found.files) >= len(names) > 0:
+                return found
+        if 2 * len(best.files) >= len(names):
+            break
     return best
 
 
-def _places(path: Path, folder: Path) -> Iterator[Path]:
-    """Folders that may hold the photos of a model, the likely ones first."""
+def _places(path: Path, folder: Path) -> Iterator[list[Path]]:
+    """Folders that may hold the photos of a model: the usual ones, any others, those of smaller copies."""
     levels = len(folder.relative_to(path).parts)
     above = [folder, *folder.parents][: levels + 1]
     outside = list(Path(os.path.abspath(path)).parents)[: max(0, _ABOVE - levels)]
     above += [each for each in outside if any((each / name).is_dir() for name in PHOTO_FOLDERS)]
     names = PHOTO_FOLDERS[::-1] if "distorted" in folder.parts else PHOTO_FOLDERS
-    yield from (each / name for each in above for name in names if (each / name).is_dir())
-    smaller = []
-    for each in above:
-        for below in folders_of(each):
-            if below.name.lower().startswith("images_"):
-                smaller.append(below)
-            elif not below.name.lower().startswith(NOT_PHOTOS) and _holds_photos(below):
-                yield below
-        yield each
-    yield from smaller
+    yield [each / name for each in above for name in names if (each / name).is_dir()]
+    below = [(each, folders_of(each)) for each in above]
+    photos = [
+        [one for one in inside if not one.name.lower().startswith(NOT_PHOTOS) and _holds_photos(one)]
+        for _, inside in below
+    ]
+    yield [place for each, inside in zip(above, photos, strict=True) for place in (*inside, each)]
+    yield [one for _, inside in below for one in inside if one.name.lower().startswith("images_")]
 
 
 def _holds_photos(folder: Path) -> bool:

@@ -1,7 +1,8 @@
 """Pixels that count: what does not belong to a scene is not trained on, not measured and has no vote.
 
 Pixels do not count where a category is ignored, where a mask of the photo is black (`masks_valid/`, the
-`mask_path` of nerfstudio), and where a photo is transparent and that means it (`Scene.alpha`).
+`mask_path` of nerfstudio), where a photo is transparent and that means it (`Scene.alpha`), and where the face
+of a cube is beyond what a fisheye saw.
 """
 
 import shutil
@@ -19,6 +20,7 @@ from sagesplat.scene.detect import VALID_FOLDER
 from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
 from sagesplat.scene.raw_photos import RawPhoto, raw_photos
 from sagesplat.scene.scene import Scene, View
+from sagesplat.scene.undistort import seen
 from sagesplat.segment.fit import fit
 from sagesplat.segment.masks import CACHE_BYTES, Masks, given_png, mask_path
 
@@ -104,6 +106,8 @@ def write_valid(
             valid &= ~np.isin(label_ids[view], np.array(sorted(ignore), np.int16))
         if transparent:
             valid &= opaque(view)
+        if view.lens is not None and view.lens.face is not None:
+            valid &= seen(view.lens, view.camera.K, view.camera.width, view.camera.height)
         if not valid.all():
             if dilation:
                 valid = np.asarray(minimum_filter(valid, 2 * dilation + 1, mode="nearest"))
@@ -145,7 +149,7 @@ class _Given:
         return valid
 
     def _in_folder(self, view: View) -> Path | None:
-        return None if self.folder is None else given_png(self.folder, view.name)
+        return None if self.folder is None else given_png(self.folder, view.photo_name)
 
 
 def _seen(path: Path, view: View, raw: RawPhoto | None) -> Pixels:
