@@ -12,7 +12,6 @@ from scipy.spatial import KDTree
 
 from sagesplat.core import geometry
 from sagesplat.core.errors import SceneError, short
-from sagesplat.core.sh import C0
 from sagesplat.io.ply_header import PlyHeader, read_header
 from sagesplat.scene.images import load_photo
 from sagesplat.scene.scene import Points, View
@@ -21,6 +20,7 @@ GREY = 128
 FAR = 10.0  # random points reach this many times as far as the volume that the cameras span
 NEIGHBOURS = 4  # views, at least one of which must also see a random point
 COLOUR_VIEWS, COLOUR_SIDE = 16, 128  # photos that colour random points; their longer side, px
+HARMONIC = 0.5 / np.sqrt(np.pi)  # value of the constant spherical harmonic
 _OF_SPLATS = ("f_dc_0", "f_dc_1", "f_dc_2")
 _COLOURS = (
     ("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"), _OF_SPLATS,
@@ -64,7 +64,7 @@ def read_points(path: Path) -> Points:
             if table.keys() >= set(names):
                 values = np.stack([table[name] for name in names], axis=1).astype(float)
                 if names[0] == "f_dc_0":
-                    values = values * C0 + 0.5
+                    values = values * HARMONIC + 0.5
                 scale = FULL.get(types[names[0]], 1.0)
                 scale = (
                     1.0

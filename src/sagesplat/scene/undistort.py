@@ -249,7 +249,9 @@ def _reach(lens: Lens) -> float:
     photo, not the corners, which would be farther out than any lens sees.
     """
     angle = np.linspace(0, np.pi, 721)[:, None]
-    around = np.linspace(0, 2 * np.pi, 8, endpoint=False) + (0 if lens.width >= lens.height else np.pi / 2)
+    corner = np.arctan2(lens.height, lens.width)
+    around = np.array([0, corner, np.pi / 2, np.pi - corner])
+    around = np.append(around, around + np.pi)  # to the middles of the sides, and to the corners
     with np.errstate(all="ignore"):
         uv = _project(
             lens, np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle) + 0 * around
@@ -257,9 +259,10 @@ def _reach(lens: Lens) -> float:
         out = np.linalg.norm(uv - intrinsics(lens)[:2, 2], axis=-1)
         grows = np.cumprod(np.append(np.ones((1, 8), bool), np.diff(out, axis=0) > 0, axis=0), axis=0)
         inside = grows * np.all((uv >= 0) & (uv <= [lens.width, lens.height]), axis=-1)
-    falls = float(angle[grows.sum(axis=0).min() - 1, 0])
-    across = float(angle[inside[:, [0, 4]].sum(axis=0).max() - 1, 0])
-    return min(falls, max(across, _FARTHEST))
+    falls = float(angle[int(grows.sum(axis=0).min()) - 1, 0])
+    across = float(angle[int(inside[:, [0, 2, 4, 6]].sum(axis=0).max()) - 1, 0])
+    farthest = float(angle[int(inside.sum(axis=0).max()) - 1, 0])
+    return min(falls, across) if farthest > _FARTHEST else falls
 
 
 def _rays(K: Float[np.ndarray, "3 3"], width: int, height: int) -> Float[np.ndarray, "H W 2"]:
