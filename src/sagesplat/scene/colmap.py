@@ -44,8 +44,8 @@ def load_colmap(
     dropped. Without points, there are random ones. Raises SceneError.
     """
     check_settings(path, downscale, test_every)
-    chosen, notes = find_model(path, images)
     with np.errstate(all="ignore"):  # damaged numbers overflow; the results are checked to be finite
+        chosen, notes = find_model(path, images)
         cameras, listed, points = read_model(chosen.folder)
         _check_names(chosen.folder, listed)
         listed = _there(chosen, listed)

@@ -66,26 +66,27 @@ def describe_photos(photos: Found) -> list[str]:
 def describe_lenses(views: Sequence[View]) -> list[str]:
     """Lines on lenses that see more than a pinhole shows: what is cropped, or how it is kept."""
     lines = []
-    for lens in {view.lens: None for view in views if view.lens and view.lens.model in WIDE}:
-        if lens.face is None and (cropped := 1 - shown_share(lens)) >= _CROPPED:
-            K = pinhole(lens)
-            across, down = np.rad2deg(2 * np.arctan([lens.width, lens.height] / K[[0, 1], [0, 1]] / 2))
-            keep = "; --fisheye faces keeps it" if len(cube_faces(lens)) > 1 else ""
-            lines.append(
-                f"{lens.model}: the views show {across:.0f} x {down:.0f} degrees, {cropped:.0%} of the photo "
-                f"is cropped{keep}"
-            )
+    whole = {view.lens for view in views if view.lens and view.lens.model in WIDE and not view.lens.face}
+    shown, lens = min(
+        ((shown_share(lens), lens) for lens in whole), default=(1.0, None), key=lambda one: one[0]
+    )
+    if lens is not None and shown <= 1 - _CROPPED:
+        K = pinhole(lens)
+        across, down = np.rad2deg(2 * np.arctan([lens.width, lens.height] / K[[0, 1], [0, 1]] / 2))
+        keep = "; --fisheye faces keeps it" if len(cube_faces(lens)) > 1 else ""
+        lines.append(
+            f"{lens.model}: the views show {across:.0f} x {down:.0f} degrees, {1 - shown:.0%} of the photo "
+            f"is cropped{keep}"
+        )
     faces = [view.lens for view in views if view.lens and view.lens.face]
     if faces:
         count = len({view.image_path for view in views if view.lens and view.lens.face})
         lines.append(f"{count} photos by {faces[0].model} are shown as {len(faces)} faces of cubes")
-    spheres = {lens for lens in faces if lens.model == SPHERE and lens.width != 2 * lens.height}
+    spheres = {lens for lens in faces if lens.model == SPHERE and lens.params[0] != 2 * lens.params[1]}
     if spheres:
-        one = next(iter(spheres))
-        lines.append(
-            f"photos of {one.width} x {one.height} px are taken as 360 x 180 degrees, though not 2:1"
-        )
-    return lines[:4]
+        w, h = next(iter(spheres)).params
+        lines.append(f"{w:.0f} x {h:.0f} px are taken as 360 x 180 degrees, though they are not 2:1")
+    return lines
 
 
 def views_of(
