@@ -11,6 +11,7 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -47,7 +48,7 @@ def main(folder: Path = ROOT.parent / "shared" / "cases", write: bool = False) -
     if not found:
         raise SystemExit(f"{folder}: no folders in it; name a folder of cases")
     counts = Counter(found.values())
-    result = {"cases": len(found), **{verdict: counts[verdict] for verdict in VERDICTS}}
+    result: dict[str, Any] = {"cases": len(found), **{verdict: counts[verdict] for verdict in VERDICTS}}
     result |= {f"{verdict} cases": [n for n, v in found.items() if v == verdict] for verdict in VERDICTS[1:]}
     finish("cases", result, write)
     if counts["fault"]:

@@ -130,6 +130,11 @@ def test_smaller_copies_in_another_format(tmp_path):
     assert {view.image_path.suffix for view in scene.views} == {".jpg"}
     assert {view.name[-4:] for view in scene.views} == {".png"}  # the names stay, whatever the size
     assert (scene.views[0].camera.width, scene.views[0].camera.height) == (20, 15)
+    next((folder / "images_2").rglob("01.jpg")).unlink()
+    with pytest.raises(
+        SceneError, match=r"images_2: 1 of the 5 photos in images/ are missing, first '.*01.png'"
+    ):
+        load_scene(folder, downscale=2)
 
 
 def test_photos_elsewhere(tmp_path):

@@ -9,11 +9,12 @@ from sagesplat.core.errors import SceneError, short
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
-from sagesplat.scene.find_model import PHOTO_FOLDERS, FoundModel, find_model
-from sagesplat.scene.find_photos import PhotoFolder, plain
+from sagesplat.scene.find_model import FoundModel, find_model
+from sagesplat.scene.find_photos import PHOTO_FOLDERS, plain
 from sagesplat.scene.loading import (
     MIN_VIEWS,
     Fisheye,
+    at_downscale,
     check_found,
     check_settings,
     describe_lenses,
@@ -50,14 +51,7 @@ def load_colmap(
         _check_names(chosen.folder, listed)
         listed = _there(chosen, listed)
         notes += describe_photos(chosen.photos)
-        files = {name: chosen.photos.folder / file for name, file in chosen.photos.files.items()}
-        small = chosen.photos.folder.with_name(f"images_{downscale}")
-        divisor = downscale
-        if downscale > 1 and small.is_dir() and small != chosen.photos.folder:
-            found = PhotoFolder(small).find(list(chosen.photos.files.values()))
-            check_found(found, "the photos of full size")
-            files = {name: small / found.files[file] for name, file in chosen.photos.files.items()}
-            divisor = 1
+        files, divisor = at_downscale(chosen.photos, downscale)
         listed = sorted(listed, key=lambda image: chosen.photos.files[image.name])
         views, rows = _views(chosen, files, cameras, listed, divisor, fisheye)
         notes += describe_lenses(views)

@@ -8,8 +8,8 @@ from pathlib import Path
 from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
 from sagesplat.scene.colmap import load_colmap
-from sagesplat.scene.find_model import MODEL_FILES, PHOTO_FOLDERS, USUAL, model_folders
-from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTOS, folders_of
+from sagesplat.scene.find_model import MODEL_FILES, USUAL, model_folders
+from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTO_FOLDERS, PHOTOS, folders_of
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scene import Scene
 

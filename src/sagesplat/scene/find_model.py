@@ -7,10 +7,9 @@ from pathlib import Path
 
 from sagesplat.core.errors import SceneError, short
 from sagesplat.scene.colmap_read import read_names
-from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTOS, Found, PhotoFolder, folders_of
+from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTO_FOLDERS, PHOTOS, Found, PhotoFolder, folders_of
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
-PHOTO_FOLDERS = ("images", "input")  # 3DGS's own scripts read photos from input/
 USUAL = ("sparse/0", "sparse")  # where models are, below a capture
 _DEEPEST = 4  # folders below the capture, such as house/colmap/sparse/0
 _ABOVE = 3  # folders above a model that was given, in which its photos are looked for

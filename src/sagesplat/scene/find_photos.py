@@ -20,6 +20,7 @@ _RAW = frozenset(
     {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gpr"}
 )  # exported as others
 _DEEPEST, _MOST = 8, 10**5  # folders below each other, and in all
+PHOTO_FOLDERS = ("images", "input")  # 3DGS's own scripts read photos from input/
 # Folders beside photos begin so: of smaller copies, masks, depths.
 NOT_PHOTOS = ("images_", "mask", "depth", "normal", "semantic", "sparse", "distorted", "confidence", "thumb")
 _SAME = {".jpeg": ".jpg", ".tiff": ".tif", ".heif": ".heic"}

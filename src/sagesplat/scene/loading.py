@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sagesplat.core.errors import SceneError, short
-from sagesplat.scene.find_photos import Found, PhotoFolder
+from sagesplat.scene.find_photos import PHOTO_FOLDERS, Found, PhotoFolder
 from sagesplat.scene.images import photo_size
 from sagesplat.scene.scene import Camera, Lens, View
 from sagesplat.scene.undistort import (
@@ -47,6 +47,24 @@ def check_found(photos: Found, of: str) -> None:
         f"{photos.folder}: {len(missing)} of the {len(photos.names)} photos of {of} are missing, first "
         f"{short(repr(missing[0]))}; add the files, or give their folder with --images"
     )
+
+
+def at_downscale(photos: Found, downscale: int) -> tuple[dict[str, Path], int]:
+    """The files of photos, by name as written, and by what their size is still to be divided.
+
+    Those in images_N beside images/, where the capture has them. SceneError where some are missing there.
+    """
+    small = photos.folder.with_name(f"images_{downscale}")
+    if downscale == 1 or photos.folder.name not in PHOTO_FOLDERS or not small.is_dir():
+        return {name: photos.folder / file for name, file in photos.files.items()}, downscale
+    found = PhotoFolder(small).find(list(photos.files.values()))
+    if found.missing:
+        raise SceneError(
+            f"{small}: {len(found.missing)} of the {len(found.names)} photos in {photos.folder.name}/ are "
+            f"missing, first {short(repr(found.missing[0]))}; add them, or move this folder away: then the "
+            "photos themselves are made smaller"
+        )
+    return {name: small / found.files[file] for name, file in photos.files.items()}, 1
 
 
 def describe_photos(photos: Found) -> list[str]:

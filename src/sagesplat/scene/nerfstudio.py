@@ -26,6 +26,7 @@ from sagesplat.scene.loading import (
     MAX_SIDE,
     MIN_VIEWS,
     Fisheye,
+    at_downscale,
     check_found,
     check_settings,
     describe_lenses,
@@ -263,24 +264,18 @@ def _views(
         root = root / "images"
         files = {name: found.removeprefix("images/") for name, found in photos.files.items()}
         photos = Found(root, written, files, prefix="images/")
-    small, divisor = root.with_name(f"images_{downscale}"), downscale
-    shipped: dict[str, str] = {}
-    if downscale > 1 and root != file.parent and small.is_dir():
-        found = PhotoFolder(small).find(list(photos.files.values()))
-        if found.missing:
-            check_found(Found(small, found.missing, {}), f"{root.name}/")
-        shipped, divisor = found.files, 1
-    masks = _masks(file, frames)
+    sized, divisor = at_downscale(photos, downscale)
+    there = [frame for frame, name in zip(frames, written, strict=True) if name in photos.files]
+    masks = _masks(file, there)
     by_frame: list[tuple[str, list[View]]] = []
     scales: list[float] = []
     for frame, name in zip(frames, written, strict=True):
         if (below := photos.files.get(name)) is None:
             continue
-        photo = small / shipped[below] if shipped else root / below
         try:
             lens, w2c = _lens(frame, root / below), frame.world_to_camera()
             valid = None if frame.mask_path is None else masks[frame.mask_path]
-            views = views_of(below, photo, w2c, lens, divisor, fisheye, valid)
+            views = views_of(below, sized[name], w2c, lens, divisor, fisheye, valid)
         except ValueError as error:
             reason = short(error)
             raise SceneError(
