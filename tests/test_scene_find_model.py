@@ -212,12 +212,13 @@ def test_points_of_a_ply_file(tmp_path, kind):
         for c in (("red", "green", "blue") if "red" in kind else "rgb")
     )
     rows = f"0 0 0 {COLOURS[kind]}\n0.1 0 0 {COLOURS[kind]}\n"
-    (tmp_path / "sparse/0/points3D.ply").write_text(f"{HEAD}{XYZ}{rest}end_header\n{rows}")
+    name = "points3D.ply" if "red" in kind else "Cloud 1.PLY"  # the only one there
+    (tmp_path / "sparse/0" / name).write_text(f"{HEAD}{XYZ}{rest}end_header\n{rows}")
     scene = load_scene(tmp_path)
     np.testing.assert_allclose(scene.points.xyz, [[0, 0, 0], [0.1, 0, 0]])
     assert scene.points.rgb.tolist() == [[1, 2, 3]] * 2
     assert len(scene.points.track_points) == 0
-    assert "the model has no 3D points: training begins with those of points3D.ply" in scene.notes
+    assert f"the model has no 3D points: training begins with those of {name}" in scene.notes
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -233,3 +234,19 @@ def test_poses_without_points(tmp_path, text, empty, monkeypatch):
     assert len(scene.points.xyz) == 300
     assert len(scene.points.track_points) == 0
     assert any(note.startswith("no 3D points: training begins with ") for note in scene.notes)
+
+
+def test_a_model_without_cameras_is_not_passed_over(tmp_path):
+    folder = moved(tmp_path, "colmap/sparse/0")
+    (folder / "colmap/sparse/0/cameras.bin").unlink()
+    with pytest.raises(SceneError, match=r"cameras\.txt: no such file; copy the whole model"):
+        load_scene(folder)
+
+
+def test_points_without_errors_and_models_in_small_letters(tmp_path):
+    capture(tmp_path, [PINHOLE], text=True)
+    path = tmp_path / "sparse/0/points3D.txt"
+    path.write_text("\n".join(" ".join(line.split()[:7]) for line in path.read_text().split("\n")[1:]))
+    path = tmp_path / "sparse/0/cameras.txt"
+    path.write_text(path.read_text().replace("PINHOLE", "pinhole"))
+    assert len(load_scene(tmp_path).points.track_points) == 5 * 16

@@ -25,7 +25,7 @@ from sagesplat.scene.points import random_points, read_points
 from sagesplat.scene.scene import Lens, Points, Scene, View
 from sagesplat.scene.undistort import FACES, SPHERE, distort, intrinsics
 
-POINT_FILES = ("points3D.ply", "points3d.ply", "points.ply", "sparse.ply", "sparse_pc.ply", "point_cloud.ply")
+POINT_FILES = ("points3d", "points", "sparse", "sparse_pc", "point_cloud", "pointcloud")  # .ply
 
 
 def load_colmap(
@@ -84,11 +84,12 @@ def _there(chosen: FoundModel, listed: Sequence[ModelImage]) -> list[ModelImage]
 
 def _points_beside(path: Path, model: Path, views: Sequence[View]) -> tuple[Points, str]:
     """The points of a capture whose model has none: those of a PLY file beside it, else random ones."""
-    for folder in (model, path):
-        for name in POINT_FILES:
-            if (file := folder / name).is_file():
-                points = read_points(file)
-                return points, f"the model has no 3D points: training begins with those of {name}"
+    for folder in dict.fromkeys((model, model.parent, path)):
+        files = sorted(file for file in folder.iterdir() if file.suffix.lower() == ".ply")
+        named = [file for file in files if file.stem.lower() in POINT_FILES]
+        for file in named or files[: folder == model and len(files) == 1]:
+            points = read_points(file)
+            return points, f"the model has no 3D points: training begins with those of {short(file.name)}"
     points = random_points(views)
     return points, f"no 3D points: training begins with {len(points.xyz):,} random ones that cameras see"
 

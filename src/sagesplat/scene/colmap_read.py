@@ -132,7 +132,7 @@ def _text_cameras(path: Path, lines: list[str]) -> dict[int, ModelCamera]:
     cameras = {}
     for line in _records(lines):
         id, model, width, height, *params = line.split()
-        name = model if model in CAMERA_MODELS else _unknown_model(path, model)
+        name = model.upper() if model.upper() in CAMERA_MODELS else _unknown_model(path, model)
         cameras[int(id)] = camera_of_model(int(id), name, int(width), int(height), [float(p) for p in params])
     return cameras
 
@@ -225,8 +225,8 @@ def _binary_points(path: Path, data: _Bytes) -> ModelPoints:
 
 
 def _text_points(path: Path, lines: list[str]) -> ModelPoints:
-    rows = [line.split(maxsplit=8)[:8] for line in _records(lines)]
-    table = np.array(rows, float).reshape(-1, 8)
+    rows = [line.split(maxsplit=7)[:7] for line in _records(lines)]  # whose error is of no use
+    table = np.array(rows, float).reshape(-1, 7)
     return _points(table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7])
 
 

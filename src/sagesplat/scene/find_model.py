@@ -85,7 +85,7 @@ def _describe(path: Path, best: FoundModel, others: dict[Path, str]) -> list[str
 
 
 def _holds_model(folder: Path) -> bool:
-    return any(os.path.isfile(folder / name) for name in MODEL_FILES)
+    return any(os.path.isfile(folder / name) for name in (*MODEL_FILES, "images.bin"))  # if in part
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
