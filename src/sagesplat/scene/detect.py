@@ -9,7 +9,7 @@ from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.find_model import MODEL_FILES, USUAL, model_folders
-from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTO_FOLDERS, PHOTOS, folders_of
+from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTOS, folders_of
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scene import Scene
 
@@ -68,10 +68,9 @@ def locate(path: Path) -> tuple[str, Path]:
     if any(_holds_photos(folder) for folder in (path, *photos)):
         return "photos", path
     looked_for = ", ".join(name for capture in CAPTURES.values() for name in capture.files)
-    folders = " and ".join(f"{name}/" for name in PHOTO_FOLDERS)
     raise SceneError(
-        f"{path}: no capture (looked for {looked_for}, other places of cameras.txt, and photos in {folders} "
-        "and the folder); give a folder that has one of them, or a video file"
+        f"{path}: no capture (looked for {looked_for}, other places of cameras.txt, and photos in images/, "
+        "input/ and the folder); give a folder that has one of them, or a video file"
     )
 
 
