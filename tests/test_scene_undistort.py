@@ -331,3 +331,18 @@ def test_pixels_beyond_a_fisheye_do_not_count(tmp_path):
     by_face = {v.lens.face: share for v, share in zip(scene.views, shares, strict=True) if v.lens}
     assert by_face["front"] == 0
     assert 0.3 < by_face["left"] < 0.6
+
+
+def test_masks_of_panoramas_are_those_of_their_faces(tmp_path):
+    capture(tmp_path, [ModelCamera(1, "EQUIRECTANGULAR", 64, 32, (64.0, 32.0))])
+    mask = np.zeros((32, 64), np.uint8)
+    mask[:, :32] = 255  # what is on the left of the photo counts
+    for photo in (tmp_path / "images").rglob("*.png"):
+        path = tmp_path / "masks_valid" / photo.relative_to(tmp_path / "images")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(path)
+    scene = load_scene(tmp_path)
+    shares = write_valid(scene, tmp_path / "valid")
+    by_face = {v.lens.face: share for v, share in zip(scene.views, shares, strict=True) if v.lens}
+    assert (by_face["left"], by_face["right"]) == (0, 1)
+    assert by_face["front"] == pytest.approx(0.5, abs=0.05)

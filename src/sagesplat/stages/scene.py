@@ -19,6 +19,8 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
 from sagesplat.scene.feature_masks import OfPhoto
+from sagesplat.scene.find_model import model_folders
+from sagesplat.scene.find_photos import PHOTO_FOLDERS
 from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.edit import ignored_ids, parse_merge, parse_names
@@ -26,6 +28,8 @@ from sagesplat.segment.mask_files import label_images_of
 from sagesplat.stages.edited import check_not_edited
 
 _CPU_PIXELS = 1.25e6  # of a photo: a training step's time and the cap of Gaussians grow with them
+# VisualSFM, Bundler, OpenSfM, OpenMVG, Meshroom, Metashape.
+_POSES_OF_OTHERS = (".nvm", "bundle.out", "reconstruction.json", "sfm_data.json", ".sfm", "cameras.xml")
 _SHARES = {1: "all", 2: "half", 4: "a quarter", 8: "an eighth"}  # of a photo's width
 
 
@@ -71,6 +75,8 @@ def open_scene(
                 f"{path}: no poses for the photos of --images; give the folder that has them, or leave out "
                 "--images"
             )
+        if unread := _unread_poses(path):
+            job.emit(Warned(f"{unread}; poses are estimated anew"))
         capture = run.capture / repaired(path.resolve().stem)  # the scene will have that name
         leaving_out = _LeavingOut(config, masks or MasksConfig(), labels or LabelsConfig())
         _find_poses(job, path, capture, poses or PosesConfig(), leaving_out)
@@ -125,6 +131,19 @@ def open_scene(
 
     run_stage(job, "scene", settings, [], [run.scene, run.geometry], make)
     photos.keep()
+
+
+def _unread_poses(path: Path) -> str:
+    """Why poses that lie beside photos or a video are not read, with the cure; empty where there are none."""
+    beside = path.name in PHOTO_FOLDERS
+    if beside and (folders := model_folders(path.parent)):
+        return f"{folders[0]}: poses of a folder that was not given (to use them, give {path.parent})"
+    folders = [folder for folder in (path, path.parent)[: 1 + beside] if folder.is_dir()]
+    for file in (file for folder in folders for file in sorted(folder.iterdir())):
+        if file.name.lower().endswith(_POSES_OF_OTHERS):
+            cure = "to keep them, export a COLMAP model or a transforms.json"
+            return f"{file}: poses of a format that is not read ({cure})"
+    return ""
 
 
 def reading(config: SceneConfig) -> dict[str, Any]:
