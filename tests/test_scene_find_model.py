@@ -148,15 +148,17 @@ def test_photos_elsewhere(tmp_path):
         load_scene(folder, images=tmp_path / "nowhere")
 
 
-def test_transforms_one_folder_deeper(tmp_path):
+@pytest.mark.parametrize("deep", ["house", "data/house"])
+def test_transforms_some_folders_deeper(tmp_path, deep):
     from test_scene_nerfstudio import capture as transforms
     from test_scene_nerfstudio import write
 
-    (tmp_path / "house").mkdir()
-    write(tmp_path / "house", transforms(tmp_path / "house"))
+    (tmp_path / deep).mkdir(parents=True)
+    write(tmp_path / deep, transforms(tmp_path / deep))
+    capture(tmp_path / deep / "colmap", [PINHOLE])
     scene = load_scene(tmp_path)
-    assert scene.notes[0] == "the capture is in house/"
-    assert len(scene.views) == 5
+    assert scene.notes[0] == f"the capture is in {deep}/"
+    assert scene.path == tmp_path / deep
 
 
 @pytest.mark.parametrize("place", ["input", "images", ".", "cam0"])

@@ -67,7 +67,9 @@ def load_scene(
         place, downscale=downscale, test_every=test_every, images=images, fisheye=fisheye
     )
     if place != path:
-        scene = replace(scene, notes=(f"the capture is in {place.name}/", *scene.notes))
+        scene = replace(
+            scene, notes=(f"the capture is in {place.relative_to(path).as_posix()}/", *scene.notes)
+        )
     alpha = scene.alpha if alpha == "auto" else alpha
     scene = replace(scene, calibrate_every=calibrate_every, alpha=alpha)
     if vignetting and any(view.lens and view.lens.face for view in scene.views):

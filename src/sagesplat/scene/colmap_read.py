@@ -37,7 +37,11 @@ class ModelPoints(NamedTuple):
 
 def read_names(folder: Path) -> list[str]:
     """The photos of the model in `folder`, as it names them. SceneError for missing or damaged files."""
-    return [image.name for image in _read(folder, "images", _binary_images, _text_images)]
+
+    def text(path: Path, lines: list[str]) -> list[str]:
+        return [image.name for image in _text_images(path, lines)]
+
+    return _read(folder, "images", _binary_names, text)
 
 
 def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], ModelPoints | None]:
@@ -163,6 +167,16 @@ def _binary_images(path: Path, data: _Bytes) -> list[ModelImage]:
         rows.append((int(id), name, int(camera_id), observed["uv"], observed["point"]))
         poses.append(pose)
     return _images(rows, poses)
+
+
+def _binary_names(path: Path, data: _Bytes) -> list[str]:
+    """The names alone: observations, which are most of the file, are passed over."""
+    names = []
+    for _ in range(data.count()):
+        data.skip(IMAGE.itemsize)
+        names.append(data.name())
+        data.skip(OBSERVATION.itemsize * data.count())
+    return names
 
 
 def _text_images(path: Path, lines: list[str]) -> list[ModelImage]:

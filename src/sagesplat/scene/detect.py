@@ -44,8 +44,8 @@ def locate(path: Path) -> tuple[str, Path]:
     """The kind of capture at a path, the first of these that matches, and where it is.
 
     - a name in `CAPTURES`: one of its files is in the folder, or the path is of one, or has its suffix;
+    - transforms, blender: in the only folder below that has such a file, as archives are unpacked;
     - colmap: a model is in the folder, or anywhere below it (`find_model`);
-    - a name in `CAPTURES` with a file: in the only folder below that has one, as archives are unpacked;
     - stored: an .npz file, such as the capture of one block (`scene.stored`);
     - photos: photos in images/, input/, the folder itself, or folders in it;
     - video: the path of a video file.
@@ -58,12 +58,13 @@ def locate(path: Path) -> tuple[str, Path]:
         raise SceneError(f"{path}: no such file or folder; give a capture's folder or a video")
     if kind := _of_folder(path):
         return kind, path
+    below = folders_of(path)
+    for folders in (below, [each for folder in below for each in folders_of(folder)]):
+        inside = [(kind, each) for each in folders if (kind := _of_folder(each)) not in (None, "colmap")]
+        if len(inside) == 1:  # nerfstudio keeps COLMAP's model beside its file, in colmap/
+            return inside[0]
     if model_folders(path):
         return "colmap", path
-    below = folders_of(path)
-    inside = [(kind, each) for each in below if (kind := _of_folder(each))]
-    if len(inside) == 1:
-        return inside[0]
     photos = [each for each in below if not each.name.lower().startswith(NOT_PHOTOS)]
     if any(_holds_photos(folder) for folder in (path, *photos)):
         return "photos", path
