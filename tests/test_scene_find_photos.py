@@ -46,6 +46,7 @@ def test_a_name_is_matched_however_it_is_written(tmp_path, written, file):
     assert found.files == {written: file}
     said = found.written_differently
     assert said.startswith("one photo is written differently") == (written.removeprefix("./") != file)
+    assert said.endswith("another form of Unicode") == (file in (NFC, NFD))
 
 
 CONFUSED = [  # names, files, and what is matched

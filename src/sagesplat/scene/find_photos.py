@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 from sagesplat.core.errors import short
-from sagesplat.core.names import check_photo, collision_key
+from sagesplat.core.names import check_photo, collision_key, composed
 
 # Their content decides how they are read (`io.pictures`).
 PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
@@ -50,9 +50,8 @@ class Found:
             return ""
         name, file = changed[0]
         of = "one photo is" if len(changed) == 1 else f"{len(changed)} of {len(self.names)} photos are"
-        return f"{of} written differently in the poses: {short(repr(name))} is {short(repr(file))}" + (
-            " (an accent is one character there, two here)" if repr(name) == repr(file) else ""
-        )
+        accents = ", with accents in another form of Unicode" if composed(name) == composed(file) else ""
+        return f"{of} written differently in the poses: {short(repr(name))} is {short(repr(file))}{accents}"
 
 
 class PhotoFolder:
