@@ -49,7 +49,7 @@ def settings(downscale: int, steps: int, nest_steps: int, levels: int) -> tuple[
     """Options of a run in three blocks that takes a minute or two."""
     return (
         f"--downscale={downscale}", f"--train.max-steps={steps}", f"--train.level-every={max(1, steps // 5)}",
-        "--blocks.count=3", f"--blocks.boundary-steps={max(1, nest_steps // 3)}",
+        "--blocks.count=3",
         f"--nest.steps={nest_steps}", f"--nest.base-steps={nest_steps}", f"--nest.levels={levels}",
         "--target-ssim=0.6",
     )  # fmt: skip

@@ -128,7 +128,7 @@ def open_job(folder: Path, scene: str, asked: Asked, say: Say) -> Job:
     if not job.run.prefixes.exists():
         config = replace(_config(scene, asked).nest, steps=asked.nest_steps, base_steps=asked.base_steps)
         clean_levels(job, CleanConfig())
-        nest_scene(job, config, RunConfig().blocks, asked.seed)
+        nest_scene(job, config, asked.seed)
     return job
 
 

@@ -47,7 +47,7 @@ CONFIG = RunConfig(
     sample=SampleConfig(views=8, calibration_views=8),
     plan=PlanConfig(target_ssim=0.4),
 )
-BLOCKS = BlocksConfig(count=2, boundary_steps=5)
+BLOCKS = BlocksConfig(count=2)
 
 
 @pytest.fixture(scope="module")
@@ -384,14 +384,14 @@ def test_blocks_lose_fused_label_images_that_the_run_lost(capture: Path, tmp_pat
 def test_the_ladders_of_a_run_in_blocks_share_its_categories_and_its_training(capture, tmp_path) -> None:
     config = replace(CONFIG, blocks=BLOCKS, ladder="snapshots")
     work(tmp_path / "run", capture, config)
-    more = replace(config, ladder="nested", blocks=replace(BLOCKS, boundary_steps=6))
+    more = replace(config, ladder="nested", blocks=BLOCKS)
     again = done(work(tmp_path / "run", capture, more))
     assert "block_categories" not in again
     assert "train" not in again
     assert again[-1] == "report"
     table = RunDir(tmp_path / "run").adapted / "blocks.csv"
     assert "" not in [row["boundaries s"] for row in rows_of(table)]
-    work(tmp_path / "run", capture, replace(more, blocks=replace(BLOCKS, boundary_steps=0)), force=True)
+    work(tmp_path / "run", capture, replace(more, nest=replace(more.nest, steps=4)), force=True)
     assert [row["boundaries s"] for row in rows_of(table)] == ["", ""]
 
 

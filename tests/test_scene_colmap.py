@@ -140,15 +140,15 @@ def breakages() -> dict:
 
     nan = np.array(np.nan).tobytes()
     return {
-        r"images: 2 of the model's 5 photos are missing, first 'part 1/02.png'": lambda f: shutil.rmtree(
-            f / "images/part 1"
+        r"images: 3 of the 5 photos of the model are missing, first 'part 0/05.png'": lambda f: shutil.rmtree(
+            f / "images/part 0"
         ),
         r"30 x 40 pixels, but its camera has another aspect ratio, 40 x 30": shrink,
         r"points3D.bin: damaged or incomplete \(it ends within a record": put("points3D.bin", 0, b"\xff" * 8),
         r"images.bin: damaged .*photo 'part 0/05.png' has a pose that is not finite": put(
             "images.bin", 12, nan
         ),
-        r"no COLMAP model \(looked for .*sparse/0": lambda f: shutil.rmtree(f / "sparse"),
+        r"no COLMAP model \(looked for cameras.bin": lambda f: shutil.rmtree(f / "sparse"),
     }
 
 
@@ -184,7 +184,7 @@ def test_real_scenes(name, views, points, error):
 BAD_NAMES = {
     b"caf\xe9.png": r"photo 'caf\\udce9\.png': it is not UTF-8; rename the photo",
     b"\x1b[31m.png": r"U\+001B; rename the photo",
-    b"/a.png": "names nothing in the folder of the photos",
+    b"a/../../../": "names nothing in the folder of the photos",
 }
 
 

@@ -1,19 +1,25 @@
 """Camera models against their definitions, and undistorted images against the scene they show."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from test_scene_colmap import capture, project
 
 from sagesplat.core.errors import SceneError
-from sagesplat.scene import describe
+from sagesplat.scene import describe, load_scene
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.colmap_write import ModelCamera
 from sagesplat.scene.images import load_photo
+from sagesplat.scene.loading import views_of
 from sagesplat.scene.scene import Camera, Lens, View
-from sagesplat.scene.undistort import CAMERA_MODELS, distort, pinhole, undistort
+from sagesplat.scene.stored import read_scene, write_scene
+from sagesplat.scene.undistort import CAMERA_MODELS, SPHERE, distort, pinhole, seen, shown_share, undistort
+from sagesplat.segment.valid import write_valid
 
 WIDTH, HEIGHT = 64, 48
 COEFFICIENTS = {
@@ -26,6 +32,15 @@ COEFFICIENTS = {
     "RADIAL_FISHEYE": (-0.02, 0.005),
     "FOV": (0.8,),
     "THIN_PRISM_FISHEYE": (0.01, 0.005, 2e-3, -1e-3, 0.001, 0.0005, 3e-3, -2e-3),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        *(0.01, 0.005, 0.001, 0.0005, -0.002, 0.001),
+        *(2e-3, -1e-3, 3e-3, -2e-3, 1e-3, 2e-3),
+    ),
+    "SIMPLE_DIVISION": (-0.08,),
+    "DIVISION": (0.05,),
+    "SIMPLE_FISHEYE": (),
+    "FISHEYE": (),
+    "EUCM": (0.55, 1.1),
 }
 
 
@@ -58,6 +73,9 @@ def unit(lens: Lens, x: float, y: float) -> tuple[float, float]:
         ("THIN_PRISM_FISHEYE", (0, 0, 0, 0, 0, 0, 1, 0), (0.407676929, -0.191952300)),
         ("THIN_PRISM_FISHEYE", (0, 0, 0, 0, 0, 0, 0, 1), (0.287928451, -0.072203822)),
         ("FOV", (0.8,), (0.3 * 1.025946805, -0.2 * 1.025946805)),
+        ("DIVISION", (-0.1,), (0.3 * 0.987321977, -0.2 * 0.987321977)),
+        ("FISHEYE", (), (0.3 * 0.959761502, -0.2 * 0.959761502)),
+        ("EUCM", (0.5, 1.0), (0.3 / 1.031507291, -0.2 / 1.031507291)),
     ],
 )
 def test_models_follow_their_definition(model, coefficients, expected):
@@ -193,3 +211,138 @@ def test_absurd_calibration_is_an_error_with_the_path(tmp_path):
     path.write_text(path.read_text().replace(" 0.1\n", " 1e9\n"))
     with pytest.raises(SceneError, match=r"sparse/0: camera 1: no pinhole view fits"):
         load_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("model", [*COEFFICIENTS, "EQUIRECTANGULAR"])
+def test_models_are_those_of_colmap(model):
+    pycolmap = pytest.importorskip("pycolmap")
+    if not hasattr(pycolmap.CameraModelId, model):
+        pytest.skip(f"pycolmap {pycolmap.__version__} has no {model}")
+    lens = SPHERE_LENS if model == SPHERE else lens_of(model)
+    camera = pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=list(lens.params))
+    rays = np.random.default_rng(0).uniform(-1, 1, (200, 3)) + np.array([0, 0, 2])
+    expected = camera.img_from_cam(rays)
+    np.testing.assert_allclose(distort(lens, rays[:, :2] / rays[:, 2:]), expected, atol=1e-9)
+    assert CAMERA_MODELS[model].id == int(getattr(pycolmap.CameraModelId, model))
+    assert CAMERA_MODELS[model].num_params == len(camera.params)
+
+
+SPHERE_LENS = Lens(SPHERE, (256.0, 128.0), 256, 128)
+FISHEYE_LENS = Lens("OPENCV_FISHEYE", (40.0, 40.0, 64.0, 64.0, 0.01, 0.0, 0.0, 0.0), 128, 128)
+
+
+def colour_around(directions: np.ndarray) -> np.ndarray:
+    """A smooth picture of the world in all directions, [..., 3] in 0 to 255."""
+    x, y, z = np.moveaxis(directions / np.linalg.norm(directions, axis=-1, keepdims=True), -1, 0)
+    return 127.5 + 100 * np.stack([np.sin(2 * x + z), np.cos(2 * y), np.sin(z - y)], -1)
+
+
+def wide_photo(lens: Lens) -> np.ndarray:
+    """What the lens sees, with black where it sees nothing."""
+    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    if lens.model == SPHERE:
+        lon, lat = (u / lens.width - 0.5) * 2 * np.pi, (v / lens.height - 0.5) * np.pi
+        return colour_around(
+            np.stack([np.cos(lat) * np.sin(lon), np.sin(lat), np.cos(lat) * np.cos(lon)], -1)
+        )
+    x, y = (u - 64) / 40, (v - 64) / 40
+    r = np.hypot(x, y)
+    angle = r
+    for _ in range(30):
+        angle = r / (1 + 0.01 * angle**2)
+    shown = colour_around(np.stack([x / r * np.sin(angle), y / r * np.sin(angle), np.cos(angle)], -1))
+    return np.where((r < 1.6)[..., None], shown, 0)  # a circle in the square
+
+
+@pytest.mark.parametrize("lens", [SPHERE_LENS, FISHEYE_LENS], ids=["sphere", "fisheye"])
+def test_faces_of_a_cube_show_the_scene(lens, tmp_path):
+    Image.fromarray(wide_photo(lens).round().astype(np.uint8)).save(tmp_path / "a.png")
+    turn = Rotation.from_euler("xyz", [0.2, 0.5, -0.3]).as_matrix()
+    w2c = np.eye(4)
+    w2c[:3, :3], w2c[:3, 3] = turn, [1, 2, 3]
+    views = views_of("cam/a.png", tmp_path / "a.png", w2c, lens, 1, "faces")
+    faces = ["front", "right", "back", "left", "up", "down"]
+    expected = faces if lens.model == SPHERE else [face for face in faces if face != "back"]
+    assert [view.name for view in views] == [f"cam/a_{face}.png" for face in expected]
+    assert {view.photo_name for view in views} == {"cam/a.png"}
+    for view in views:
+        camera = view.camera
+        assert camera.width == camera.height == round(2 * (256 / (2 * np.pi) if lens.model == SPHERE else 40))
+        np.testing.assert_allclose(camera.position, -turn.T @ [1, 2, 3], atol=1e-5)
+        assert camera.K[0].tolist() == [camera.width / 2, 0, camera.width / 2]  # 90 degrees
+        u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        rays = np.stack([u, v, 0 * u + 1], -1)
+        rays[..., :2] = (rays[..., :2] - camera.K[:2, 2]) / camera.K[0, 0]
+        world = rays @ camera.w2c[:3, :3]
+        shown = seen(view.lens, camera.K, camera.width, camera.height)
+        difference = np.abs(load_photo(view) - colour_around(world @ turn.T))[shown]
+        assert np.quantile(difference, 0.99) < 2.5
+        assert shown.all() == (lens.model == SPHERE or "front" in view.name)
+        angle = np.arccos((world @ turn.T)[..., 2] / np.linalg.norm(world, axis=-1))
+        if lens.model != SPHERE:
+            assert shown[angle < 1.53].all()
+            assert not shown[angle > 1.57].any()
+
+
+def test_a_narrow_lens_stays_one_view(tmp_path):
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "a.png")
+    for lens in (
+        lens_of("OPENCV"),
+        lens_of("SIMPLE_RADIAL"),
+        Lens("PINHOLE", (45.0, 45.0, 33.0, 22.0), 64, 48),
+    ):
+        views = views_of("a.png", tmp_path / "a.png", np.eye(4), lens, 1, "faces")
+        assert [view.name for view in views] == ["a.png"]
+
+
+def test_what_a_wide_fisheye_loses_is_said(tmp_path):
+    assert shown_share(lens_of("OPENCV_FISHEYE")) > 0.8
+    assert shown_share(FISHEYE_LENS) == pytest.approx(0.45, abs=0.1)
+    capture(tmp_path, [ModelCamera(1, "OPENCV_FISHEYE", 128, 128, FISHEYE_LENS.params)])
+    scene = load_scene(tmp_path)
+    (note,) = [note for note in scene.notes if "OPENCV_FISHEYE" in note]
+    assert re.fullmatch(
+        r"OPENCV_FISHEYE: the views show 14\d x 14\d degrees, [456]\d% of the photo is cropped; "
+        r"--fisheye faces keeps it", note,
+    )  # fmt: skip
+    faces = load_scene(tmp_path, fisheye="faces", test_every=0)
+    assert len(faces.views) == 25
+    assert "5 photos by OPENCV_FISHEYE are shown as 25 faces of cubes" in faces.notes
+    assert project(faces).max() < 1e-3
+    assert (faces.points.track_views < 25).all()
+
+
+def test_panoramas_become_faces_with_tracks_and_masks(tmp_path):
+    capture(tmp_path, [ModelCamera(1, "EQUIRECTANGULAR", 64, 32, (64.0, 32.0))])
+    scene = load_scene(tmp_path, test_every=0, downscale=2)
+    assert len(scene.views) == 30
+    assert "5 photos by EQUIRECTANGULAR are shown as 30 faces of cubes" in scene.notes
+    assert project(scene).max() < 1e-3
+    assert len(scene.points.track_points) == 5 * 16  # every point is in one face
+    assert scene.views[0].camera.width == 10  # 64 / pi, halved
+    write_scene(tmp_path / "scene.npz", scene)
+    assert read_scene(tmp_path / "scene.npz").views[7].lens == scene.views[7].lens
+
+
+def test_pixels_beyond_a_fisheye_do_not_count(tmp_path):
+    capture(tmp_path, [ModelCamera(1, "OPENCV_FISHEYE", 128, 128, FISHEYE_LENS.params)])
+    scene = load_scene(tmp_path, fisheye="faces")
+    shares = write_valid(scene, tmp_path / "valid")
+    by_face = {v.lens.face: share for v, share in zip(scene.views, shares, strict=True) if v.lens}
+    assert by_face["front"] == 0
+    assert 0.3 < by_face["left"] < 0.6
+
+
+def test_masks_of_panoramas_are_those_of_their_faces(tmp_path):
+    capture(tmp_path, [ModelCamera(1, "EQUIRECTANGULAR", 64, 32, (64.0, 32.0))])
+    mask = np.zeros((32, 64), np.uint8)
+    mask[:, :32] = 255  # what is on the left of the photo counts
+    for photo in (tmp_path / "images").rglob("*.png"):
+        path = tmp_path / "masks_valid" / photo.relative_to(tmp_path / "images")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(path)
+    scene = load_scene(tmp_path)
+    shares = write_valid(scene, tmp_path / "valid")
+    by_face = {v.lens.face: share for v, share in zip(scene.views, shares, strict=True) if v.lens}
+    assert (by_face["left"], by_face["right"]) == (0, 1)
+    assert by_face["front"] == pytest.approx(0.5, abs=0.05)

@@ -276,7 +276,7 @@ def test_bands_are_measured_apart() -> None:
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
     train=TrainConfig(max_steps=40, level_every=20, sh_degree=1),
-    blocks=BlocksConfig(count=2, boundary_steps=20),
+    blocks=BlocksConfig(count=2),
     nest=NestConfig(steps=30, levels=4, smallest=0.1, base_steps=30),
     fit=FitConfig(),
     sample=SampleConfig(views=8, calibration_views=8),
@@ -368,7 +368,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     before = job_of(path).names()
     make_instances(job_of(path), MasksConfig(), LabelsConfig(instances="potted plant"))
     few = replace(CONFIG.nest, steps=4, levels=2, base_share=0.0)
-    nest_scene(job_of(path, force=True), few, BlocksConfig(count=2, boundary_steps=0), 0)
+    nest_scene(job_of(path, force=True), few, 0)
     job = job_of(path)
     names, ladder = job.names(), job.ladder
     assert isinstance(ladder, PrefixLadder)
@@ -426,7 +426,7 @@ def test_a_run_keeps_its_blocks(finished: Path, capture: Path) -> None:
     with pytest.raises(RunError, match=r"this run is in blocks; add --blocks\.count"):
         run_in_blocks(capture, finished, whole)
     with pytest.raises(RunError, match=r"made with other count \(2 then, 3 now\)"):
-        run_in_blocks(capture, finished, replace(CONFIG, blocks=BlocksConfig(count=3, boundary_steps=20)))
+        run_in_blocks(capture, finished, replace(CONFIG, blocks=BlocksConfig(count=3)))
 
 
 @pytest.mark.slow

@@ -84,12 +84,12 @@ def test_it_is_done_once_and_can_be_switched_off(run: RunDir) -> None:
 def test_nested_levels_are_made_of_what_is_left(run: RunDir) -> None:
     spoil(run)
     clean_levels(job_of(run), CleanConfig())
-    nest_scene(job_of(run, force=True), SMALL_RUN.nest, BlocksConfig(), 0)
+    nest_scene(job_of(run, force=True), SMALL_RUN.nest, 0)
     job = job_of(run)
     assert job.ladder.size(job.ladder.levels[-1]) == sum(read_header(run.cleaned).counts.values())
     run.cleaned.write_bytes(b"PK")
     with pytest.raises(DataError, match=r"cleaned\.npz: .*delete it and run `sagesplat clean` again"):
-        nest_scene(job_of(run, force=True), SMALL_RUN.nest, BlocksConfig(), 0)
+        nest_scene(job_of(run, force=True), SMALL_RUN.nest, 0)
 
 
 def test_another_training_is_cleaned_anew(run: RunDir) -> None:

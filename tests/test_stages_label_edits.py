@@ -112,7 +112,7 @@ def test_later_commands_find_the_edited_run_done(run: Path, viewer: Path) -> Non
     done = later_commands(made.path)
     assert [("StageSkipped", stage) for stage in ("observe", "sample", "fit", "plan")] == done[:4]
     with pytest.raises(RunError, match="made by editing"):
-        block_levels.nest_scene(job_of(made.path), RunConfig().nest, RunConfig().blocks, 0)
+        block_levels.nest_scene(job_of(made.path), RunConfig().nest, 0)
 
 
 def test_a_merged_category_has_the_levels_of_its_parts(run: Path, viewer: Path) -> None:

@@ -55,7 +55,7 @@ def test_what_follows_is_made_from_them(refined, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(refined[0], folder)
     job = Job(RunDir(folder), lambda event: None, "cpu", force=True)
-    nest_scene(job, SMALL_RUN.nest, BlocksConfig(), 0)
+    nest_scene(job, SMALL_RUN.nest, 0)
     observe_levels(job, SMALL_RUN.fit)
     assert uses(job.run, "nest", job.run.cameras)
     assert uses(job.run, "observe", job.run.cameras)

@@ -216,7 +216,7 @@ def test_a_run_with_sky(capture, tmp_path):
     train_scene(job, replace(SMALL_RUN.train, max_steps=2), BlocksConfig(), 0)
     trained = job.load_last_level()
     clean_levels(job, CleanConfig(max_loss=9.0))
-    nest_scene(job, replace(SMALL_RUN.nest, base_share=0.3, base_steps=1), BlocksConfig(), 0)
+    nest_scene(job, replace(SMALL_RUN.nest, base_share=0.3, base_steps=1), 0)
     found = job.sky
     assert found is not None
     lines = [line for event in events if isinstance(event, StageDone) for line in event.lines]

@@ -266,7 +266,6 @@ def block_categories(run: Run, machine: Annotated[Compute, Flat] = Compute()) ->
 def nest(
     run: Run,
     nest: NestConfig = NestConfig(),
-    blocks: BlocksConfig = BlocksConfig(),
     machine: Annotated[Parallel, Flat] = Parallel(),
     seed: Seed = 0,
 ) -> None:
@@ -274,7 +273,7 @@ def nest(
     from sagesplat.stages.block_levels import nest_scene
 
     with open_job(run, machine) as job:
-        nest_scene(job, nest, blocks, seed)
+        nest_scene(job, nest, seed)
 
 
 @command

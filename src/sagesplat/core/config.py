@@ -39,6 +39,11 @@ class SceneConfig:
     vignetting: bool = False
     """Undo the vignetting of the photos: the light that the lens loses towards the corners, estimated from
     points that photos show at different places. Quality is then measured against the corrected photos."""
+    images: Path | None = None
+    """Folder of the photos that poses are for (default: found beside the poses)."""
+    fisheye: Literal["crop", "faces"] = "crop"
+    """Photos of fisheye lenses. crop: what one straight view shows of them; faces: all of them, as the faces
+    of a cube. Photos of 360 degrees always become faces."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +144,7 @@ class TrainConfig:
     it; off: the sky is trained like everything else."""
     strategy: Literal["default", "mcmc"] = "default"
     """Densification. default: clone, split, prune and reset as 3DGS; mcmc: relocation and noise as
-    3DGS-MCMC."""
+    3DGS-MCMC, from 15,000 steps on with its regularisation."""
     refine_every: PositiveInt31 = 100
     """Steps between two densifications, not scaled: the gradient statistics need the views."""
     refine_start: Int31 = 500
@@ -157,8 +162,6 @@ class TrainConfig:
     outliers: bool = False
     """Leave out what single photos show and the model does not, such as people that no mask names: found by
     the residual, from 30 % of the steps on and after ten visits of each view (at the latest from 60 %)."""
-    mcmc_regularise: bool = True
-    """With mcmc, pull opacities and scales towards 0 as published. It costs quality in short trainings."""
     freeze_at: SomeShare | None = None
     """Stop each category when its mean SSIM in the training views reaches this (Fig. 1 of the paper)."""
 
@@ -181,8 +184,6 @@ class BlocksConfig:
     count: Annotated[int, Meta(ge=1, le=4096)] = 1
     """Ground-plane blocks that are trained independently and merged; 1: no blocks. The --train options hold
     for each block."""
-    boundary_steps: Int31 = 300
-    """Boundary tuning: training steps on the Gaussians near the border of each block, after merging."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ class NestConfig:
     """Nested levels: prefixes of one ordered model."""
 
     steps: Int31 = 2400
-    """Training steps on random compositions of levels."""
+    """Training steps on random compositions of levels; in blocks an eighth more of them, near each border."""
     levels: Annotated[int, Meta(ge=1, le=64)] = 16
     """Levels per category; their sizes grow geometrically."""
     smallest: SomeShare = 0.01

@@ -44,8 +44,6 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     train = _made(run, "train") or _begun(run)
     nest = _made(run, "nest")
     observed = {**_made(run, "observe"), **_made(run, "fit")}
-    tuned = nest.get("boundary_steps")
-    boundary = {} if tuned is None else {"boundary_steps": tuned}
     adopted = _made(run, "adopt")
     scene, label_images = known_json(run.scene, _Made), known_json(run.segmentation, dict) or {}
     if adopted.get("labelled"):
@@ -59,7 +57,7 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         "labels": _config(LabelsConfig, _labels(run)),
         "train": _config(TrainConfig, train),
         "clean": _config(CleanConfig, _made(run, "clean")),
-        "blocks": _config(BlocksConfig, {**_made(run, "blocks"), **boundary}),
+        "blocks": _config(BlocksConfig, _made(run, "blocks")),
         "nest": _config(NestConfig, nest),
         "sample": _config(SampleConfig, _made(run, "sample")),
         "fit": _config(FitConfig, observed),

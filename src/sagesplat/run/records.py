@@ -26,7 +26,6 @@ class _More:
 
     seed: Seed = 0
     targets: list[Number] = field(default_factory=list)
-    boundary_steps: int = 0
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import offset_text
 from sagesplat.io.colour_profile import describe_profiles
-from sagesplat.scene.detect import CAPTURES, detect
+from sagesplat.scene.detect import CAPTURES, locate
 from sagesplat.scene.given_masks import GivenMasks
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
@@ -22,6 +22,7 @@ __all__ = ["describe", "load_scene"]
 def load_scene(
     path: Path | str, *, downscale: int = 1, test_every: int = 8, calibrate_every: int = 0,
     alpha: Literal["auto", "background", "ignore"] = "auto", vignetting: bool = False,
+    images: Path | str | None = None, fisheye: Literal["crop", "faces"] = "crop",
 ) -> Scene:  # fmt: skip
     """Load a capture: posed photos and structure-from-motion points.
 
@@ -30,17 +31,20 @@ def load_scene(
     videos without poses are not captures: `photos.reconstruct` makes one of them.
 
     Args:
-        path: Folder of the capture, or its transforms.json.
+        path: Folder of the capture, its transforms.json, or the folder of a COLMAP model.
         downscale: Photos are this many times smaller than the files in images/. Intrinsics follow.
         test_every: Every n-th view by name is a test view; 0: none. A split that the dataset lists is kept.
         calibrate_every: Every n-th of the other views calibrates promises; 0: none, 1 is refused.
         alpha: Transparent pixels of photos. background: of an object that was cut out, composited over the
             background; ignore: pixels that do not count; auto: by their place in the photos.
         vignetting: Estimate it from the photos, which are then read without it (`View.vignetting`).
+        images: Folder of the photos; None: found beside the poses.
+        fisheye: Photos of wide lenses. crop: what a pinhole shows of them; faces: all, as a cube's faces.
 
     Returns:
-        The scene. Photos themselves are read when they are needed (`scene.images.Photos`). A stored scene is
-        returned as it was stored, whatever the arguments.
+        The scene; `Scene.notes` says what was decided while it was read. Photos themselves are read when they
+        are needed (`scene.images.Photos`). A stored scene is returned as it was stored, whatever the
+        arguments.
 
     Raises:
         SceneError: If nothing at `path` is a capture, a file of it is damaged, or an argument is impossible.
@@ -54,14 +58,26 @@ def load_scene(
     path = Path(path)
     if calibrate_every < 0 or calibrate_every == 1:
         raise SceneError(f"{path}: calibrate_every {calibrate_every} leaves nothing; take 0 or >= 2")
-    kind = detect(path)
+    kind, place = locate(path)
     if kind in ("photos", "video"):
         raise SceneError(f"{path}: {kind} without poses; `sagesplat run` finds them")
     if kind == "stored":
         return read_scene(path)
-    scene = CAPTURES[kind].load(path, downscale=downscale, test_every=test_every)
+    images = None if images is None else Path(images)
+    if images is not None and not images.is_dir():
+        raise SceneError(f"{images}: no such folder; give the folder of the photos")
+    scene = CAPTURES[kind].load(
+        place, downscale=downscale, test_every=test_every, images=images, fisheye=fisheye
+    )
+    if place != path:
+        scene = replace(
+            scene, notes=(f"the capture is in {place.relative_to(path).as_posix()}/", *scene.notes)
+        )
     alpha = scene.alpha if alpha == "auto" else alpha
     scene = replace(scene, calibrate_every=calibrate_every, alpha=alpha)
+    if vignetting and any(view.lens and view.lens.face for view in scene.views):
+        no = "vignetting is not undone in faces of cubes"  # it would be that of the whole photo
+        return replace(scene, notes=(*scene.notes, no))
     return with_vignetting(scene, estimate_vignetting(scene, Photos(scene.views))) if vignetting else scene
 
 

@@ -38,13 +38,14 @@ class NamedCamera:
     offset: Position = NO_OFFSET  # that was subtracted from its position in the file; of all in it the same
 
 
-def read_camera_file(path: Path) -> list[NamedCamera]:
+def read_camera_file(path: Path, images: Path | None = None) -> list[NamedCamera]:
     """The cameras of a file or a capture, in its order.
 
     Args:
         path: cameras.json as 3DGS writes it (camera to world, OpenCV axes), viewpoints.json of a run,
             transforms.json, or a folder with a COLMAP workspace, nerfstudio's transforms or such a
             cameras.json. A transforms.json without its photos is read for its poses and intrinsics.
+        images: folder of a capture's photos; None: found beside the poses.
 
     Returns:
         At least one camera; those of captures with their photos.
@@ -56,10 +57,10 @@ def read_camera_file(path: Path) -> list[NamedCamera]:
     if path.is_dir() and (path / "cameras.json").is_file():
         path = path / "cameras.json"
     if path.is_dir() or path.suffix != ".json":
-        return _of_capture(path)
+        return _of_capture(path, images)
     document = read_json(path, _CURE)
     if isinstance(document, dict) and document.get("format") != VIEWPOINTS:
-        return _of_transforms(path)
+        return _of_transforms(path, images)
     with refused(path, "a list of cameras", _CURE):
         if isinstance(document, list):
             entries = convert_as(document, list[_Of3dgs])
@@ -76,16 +77,16 @@ def read_camera_file(path: Path) -> list[NamedCamera]:
     return found
 
 
-def _of_capture(path: Path) -> list[NamedCamera]:
-    scene = load_scene(path, test_every=0)
+def _of_capture(path: Path, images: Path | None) -> list[NamedCamera]:
+    scene = load_scene(path, test_every=0, images=images)
     return [NamedCamera(repaired(view.name), view.camera, view, scene.offset) for view in scene.views]
 
 
-def _of_transforms(path: Path) -> list[NamedCamera]:
+def _of_transforms(path: Path, images: Path | None) -> list[NamedCamera]:
     """Of a transforms.json: with its photos if they are there."""
     cameras, complete, offset = frame_cameras(path)
-    if complete:
-        return _of_capture(path)
+    if complete or images is not None:
+        return _of_capture(path, images)
     return [NamedCamera(repaired(name), _within_limits(camera), offset=offset) for name, camera in cameras]
 
 

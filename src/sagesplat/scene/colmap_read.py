@@ -19,6 +19,7 @@ from sagesplat.scene.undistort import CAMERA_MODELS
 
 MODEL_NAMES = {model.id: name for name, model in CAMERA_MODELS.items()}
 MAX_SIDE = 10**6  # pixels
+_SUFFIXES = (".bin", ".txt")
 # The fixed-length part of a record in each binary file.
 CAMERA = np.dtype([("id", "<u4"), ("model", "<i4"), ("width", "<u8"), ("height", "<u8")])
 IMAGE = np.dtype([("id", "<u4"), ("pose", "<f8", 7), ("camera", "<u4")])
@@ -34,43 +35,65 @@ class ModelPoints(NamedTuple):
     rgb: UInt8[np.ndarray, "P 3"]
 
 
-def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], ModelPoints]:
+def read_names(folder: Path) -> list[str]:
+    """The photos of the model in `folder`, as it names them. SceneError for missing or damaged files."""
+
+    def text(path: Path, lines: list[str]) -> list[str]:
+        return [image.name for image in _text_images(path, lines)]
+
+    return _read(folder, "images", _binary_names, text)
+
+
+def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], ModelPoints | None]:
     """Cameras by id, posed images and points of the model in `folder`; binary files are preferred to text.
 
-    SceneError for missing or damaged files. All numbers are finite, but not checked further. Memory stays
-    within a small multiple of the file sizes: the counts in the files are not trusted.
+    None for points where there is no points3D.bin or .txt, as other tools leave it out. SceneError for
+    missing or damaged files. All numbers are finite, but not checked further. Memory stays within a small
+    multiple of the file sizes: the counts in the files are not trusted.
     """
-    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
-    cameras = _read(folder / f"cameras{suffix}", _binary_cameras, _text_cameras)
-    listed = _read(folder / f"images{suffix}", _binary_images, _text_images)
-    points = _read(folder / f"points3D{suffix}", _binary_points, _text_points)
-    if not len(points.ids):
-        return cameras, listed, points
+    cameras = _read(folder, "cameras", _binary_cameras, _text_cameras)
+    listed = _read(folder, "images", _binary_images, _text_images)
+    points = None
+    if any((folder / f"points3D{suffix}").is_file() for suffix in _SUFFIXES):
+        points = _read(folder, "points3D", _binary_points, _text_points)
+    ids = np.zeros(0, np.int64) if points is None else points.ids
 
-    def rows(ids: np.ndarray) -> np.ndarray:
-        at = np.minimum(np.searchsorted(points.ids, ids), len(points.ids) - 1)
-        return np.where(points.ids[at] == ids, at, -1)
+    def rows(of: np.ndarray) -> np.ndarray:
+        if not len(ids):
+            return np.full(len(of), -1)
+        at = np.minimum(np.searchsorted(ids, of), len(ids) - 1)
+        return np.where(ids[at] == of, at, -1)
 
     return cameras, [replace(i, point_rows=rows(i.point_rows)) for i in listed], points
 
 
-def _read(path: Path, binary: Callable, text: Callable) -> Any:
+def _read(folder: Path, part: str, binary: Callable, text: Callable) -> Any:
+    path = next((p for s in _SUFFIXES if (p := folder / f"{part}{s}").is_file()), folder / f"{part}.txt")
     try:
+        content = path.read_bytes()
         if path.suffix == ".bin":
-            data = _Bytes(path.read_bytes())
+            data = _Bytes(content)
             value = binary(path, data)
             if data.at != len(data.data):
                 raise ValueError(f"{len(data.data) - data.at} bytes more than expected")
             return value
-        # bytes that are not UTF-8 stay what they are in paths: a photo may be named so
-        content = path.read_text(encoding="utf-8", errors="surrogateescape")
-        return text(path, [line.strip() for line in content.split("\n")])
+        return text(path, [line.strip() for line in _decoded(content).split("\n")])
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; copy the whole model (cameras, images, points3D)") from None
     except (OSError, ValueError, IndexError, OverflowError) as error:
         raise SceneError(
             f"{path}: damaged or incomplete ({short(error)}); copy or export the model again"
         ) from None
+
+
+def _decoded(content: bytes) -> str:
+    """A text file of any machine: with or without a byte order mark, which Windows puts before UTF-8 and -16.
+
+    Bytes that are not UTF-8 stay what they are in paths: a photo may be named so.
+    """
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16")
+    return content.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "surrogateescape")
 
 
 class _Bytes:
@@ -113,15 +136,15 @@ def _text_cameras(path: Path, lines: list[str]) -> dict[int, ModelCamera]:
     cameras = {}
     for line in _records(lines):
         id, model, width, height, *params = line.split()
-        name = model if model in CAMERA_MODELS else _unknown_model(path, model)
+        name = model.upper() if model.upper() in CAMERA_MODELS else _unknown_model(path, model)
         cameras[int(id)] = camera_of_model(int(id), name, int(width), int(height), [float(p) for p in params])
     return cameras
 
 
 def _unknown_model(path: Path, model: str) -> str:
     raise SceneError(
-        f"{path}: camera model {model} is unknown (known: {', '.join(CAMERA_MODELS)}); "
-        "undistort the photos with COLMAP's image_undistorter"
+        f"{path}: camera model {short(model)} is unknown (known: {', '.join(CAMERA_MODELS)}); "
+        "find the poses again with one of these"
     )
 
 
@@ -130,7 +153,7 @@ def camera_of_model(id: int, name: str, width: int, height: int, params: list[fl
     model = CAMERA_MODELS[name]
     if len(params) != model.num_params or not np.isfinite(params).all():
         raise ValueError(f"camera {id}: {name} has {model.num_params} finite parameters, not {params[:13]}")
-    if min(params[: model.num_focal]) <= 0 or not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+    if min(params[: model.num_focal or 2]) <= 0 or not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise ValueError(f"camera {id}: focal length {params[0]} or size {width} x {height} out of range")
     return ModelCamera(id, name, width, height, tuple(params))
 
@@ -146,17 +169,43 @@ def _binary_images(path: Path, data: _Bytes) -> list[ModelImage]:
     return _images(rows, poses)
 
 
+def _binary_names(path: Path, data: _Bytes) -> list[str]:
+    """The names alone: observations, which are most of the file, are passed over."""
+    names = []
+    for _ in range(data.count()):
+        data.skip(IMAGE.itemsize)
+        names.append(data.name())
+        data.skip(OBSERVATION.itemsize * data.count())
+    return names
+
+
 def _text_images(path: Path, lines: list[str]) -> list[ModelImage]:
-    rows, poses = [], []
-    remaining = iter(lines)
-    for line in remaining:
-        if not line or line.startswith("#"):
+    """The images. COLMAP writes a line of observations after each, which files written by hand leave out."""
+    rows: list[tuple] = []
+    poses: list[np.ndarray] = []
+    nothing = np.zeros((0, 2)), np.zeros(0, np.int64)
+    for line in _records(lines):
+        if rows and rows[-1][3] is nothing[0] and (observed := _observations(line)) is not None:
+            rows[-1] = (*rows[-1][:3], observed[:, :2], observed[:, 2].astype(np.int64))
             continue
         id, *pose, camera_id, name = line.split(maxsplit=9)
-        observed = np.array(next(remaining, "").split(), float).reshape(-1, 3)  # the second line may be empty
-        rows.append((int(id), name, int(camera_id), observed[:, :2], observed[:, 2].astype(np.int64)))
+        rows.append((int(id), name, int(camera_id), *nothing))
         poses.append(np.array(pose, float))
     return _images(rows, poses)
+
+
+def _observations(line: str) -> np.ndarray | None:
+    """The numbers of a line of observations [M, 3]; None for the line of an image, which has a name."""
+    words = line.split()
+    try:
+        numbers = np.array(words, float).reshape(-1, 3)
+    except ValueError:
+        if len(words) < 10:
+            raise
+        return None
+    # the name may be of numbers, too: then the four that turn the camera tell
+    named = len(words) > 10 and abs(float(np.linalg.norm(numbers.ravel()[1:5])) - 1) < 1e-3
+    return None if named else numbers
 
 
 def _images(rows: list[tuple], poses: list[np.ndarray]) -> list[ModelImage]:
@@ -190,8 +239,8 @@ def _binary_points(path: Path, data: _Bytes) -> ModelPoints:
 
 
 def _text_points(path: Path, lines: list[str]) -> ModelPoints:
-    rows = [line.split(maxsplit=8)[:8] for line in _records(lines)]
-    table = np.array(rows, float).reshape(-1, 8)
+    rows = [line.split(maxsplit=7)[:7] for line in _records(lines)]  # whose error is of no use
+    table = np.array(rows, float).reshape(-1, 7)
     return _points(table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4:7])
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 
 from sagesplat.core.errors import SceneError
 from sagesplat.scene import stored
-from sagesplat.scene.colmap import MODEL_FILES, load_colmap
+from sagesplat.scene.colmap import load_colmap
+from sagesplat.scene.find_model import MODEL_FILES, USUAL, model_folders
+from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTOS, folders_of
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
 from sagesplat.scene.scans import (
     is_metashape,
@@ -19,8 +21,6 @@ from sagesplat.scene.scans import (
 )
 from sagesplat.scene.scene import Scene
 
-# Their content decides how they are read (`io.pictures`).
-PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
 VIDEOS = frozenset(
     {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp"}
 )
@@ -31,13 +31,13 @@ class CaptureFormat:
     """How captures of one format, photos with poses, are recognised and loaded."""
 
     files: tuple[str, ...]  # in the capture's folder: one of them is there
-    load: Callable[..., Scene]  # (path, downscale=, test_every=) -> the scene
+    load: Callable[..., Scene]  # (path, downscale=, test_every=, images=, fisheye=) -> the scene
     suffix: str | None = None  # of other files that stand for a capture
     holds: Callable[[Path], bool] = lambda folder: False  # or this says that the folder is one
 
 
 CAPTURES = {
-    "colmap": CaptureFormat(MODEL_FILES, load_colmap),
+    "colmap": CaptureFormat(tuple(f"{place}/{name}" for place in USUAL for name in MODEL_FILES), load_colmap),
     "transforms": CaptureFormat(("transforms.json",), load_transforms, suffix=".json"),
     "blender": CaptureFormat(("transforms_train.json",), load_blender),
     "polycam": CaptureFormat((), load_polycam, holds=is_polycam),
@@ -47,30 +47,51 @@ CAPTURES = {
 
 
 def detect(path: Path) -> str:
-    """The kind of capture at a path: the first of these that matches.
+    """The kind of capture at a path: see `locate`. SceneError if there is none."""
+    return locate(path)[0]
+
+
+def locate(path: Path) -> tuple[str, Path]:
+    """The kind of capture at a path, the first of these that matches, and where it is.
 
     - a name in `CAPTURES`: one of its files is in the folder, or the path is of one, or has its suffix;
+    - transforms, blender: in the only folder below that has such a file, as archives are unpacked;
+    - colmap: a model is in the folder, or anywhere below it (`find_model`);
     - stored: an .npz file, such as the capture of one block (`scene.stored`);
-    - photos: photos in images/, or in the folder itself;
+    - photos: photos in images/, input/, the folder itself, or folders in it;
     - video: the path of a video file.
 
     Raises SceneError if none matches.
     """
     if os.path.isfile(path):  # Path's own methods fail for names that no disk can hold
-        return _of_file(path)
+        return _of_file(path), path
     if not os.path.isdir(path):
         raise SceneError(f"{path}: no such file or folder; give a capture's folder or a video")
+    if kind := _of_folder(path):
+        return kind, path
+    below = folders_of(path)
+    for folders in (below, [each for folder in below for each in folders_of(folder)]):
+        inside = [(kind, each) for each in folders if (kind := _of_folder(each)) not in (None, "colmap")]
+        if len(inside) == 1:  # nerfstudio keeps COLMAP's model beside its file, in colmap/
+            return inside[0]
+    if model_folders(path):
+        return "colmap", path
+    photos = [each for each in below if not each.name.lower().startswith(NOT_PHOTOS)]
+    if any(_holds_photos(folder) for folder in (path, *photos)):
+        return "photos", path
+    looked_for = ", ".join(name for capture in CAPTURES.values() for name in capture.files)
+    raise SceneError(
+        f"{path}: no capture (looked for {looked_for}, other places of cameras.txt, folders of Polycam and "
+        "Record3D, cameras of Metashape, and photos in images/, input/ and the folder); give a folder that "
+        "has one of them, or a video file"
+    )
+
+
+def _of_folder(path: Path) -> str | None:
     for kind, capture in CAPTURES.items():
         if any((path / name).is_file() for name in capture.files) or capture.holds(path):
             return kind
-    if any(_holds_photos(folder) for folder in (path / "images", path)):
-        return "photos"
-    looked_for = ", ".join(name for capture in CAPTURES.values() for name in capture.files)
-    raise SceneError(
-        f"{path}: no capture (looked for {looked_for}, Polycam's and Record3D's, cameras of Metashape, "
-        "and photos in images/ and the folder); "
-        "give a folder that has one of them, or a video file"
-    )
+    return None
 
 
 def _of_file(path: Path) -> str:

@@ -12,7 +12,7 @@ from sagesplat.core.errors import SceneError
 from sagesplat.io.colour_profile import in_srgb
 from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.scene.scene import View
-from sagesplat.scene.undistort import undistort
+from sagesplat.scene.undistort import intrinsics, undistort
 from sagesplat.scene.vignetting import corrected
 
 _STRIP = 2**20  # pixels that are converted at a time
@@ -90,7 +90,7 @@ def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
     become RGB, 16 bits become 8, and alpha is composited over the camera's background. Raises SceneError.
     Memory: up to 24 bytes for each pixel of the file, whose number `open_picture` limits.
     """
-    size = (view.camera.width, view.camera.height)
+    size = _size_to_read(view)
     try:
         with open_picture(view.image_path) as file:
             if file.width * file.height > _HUGE:
@@ -98,10 +98,19 @@ def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
             image = as_rgb(file, view.camera.background)
     except PictureError as error:
         raise _unreadable(view.image_path, error) from None
-    if image.size != size:
+    if image.size != size and (view.lens is None or not view.lens.face or image.width > 1.5 * size[0]):
         image = image.resize(size, Image.Resampling.BOX)  # first, as undistortion costs more per pixel
     photo = undistort(np.array(image), view.lens, view.camera, order=1)
     return photo if view.vignetting is None else corrected(photo, view.vignetting, view.camera)
+
+
+def _size_to_read(view: View) -> tuple[int, int]:
+    """The size of the whole photo at the view's resolution: that of its camera, unless it shows a part."""
+    lens, camera = view.lens, view.camera
+    if lens is None or lens.face is None:
+        return camera.width, camera.height
+    scale = camera.K[0, 0] / intrinsics(lens)[0, 0]
+    return max(1, round(lens.width * scale)), max(1, round(lens.height * scale))
 
 
 class Photos:

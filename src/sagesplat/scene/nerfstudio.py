@@ -9,7 +9,7 @@ import os.path
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,21 +21,38 @@ from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import read_json
 from sagesplat.io.typed import convert_as, refused
+from sagesplat.scene.find_photos import Found, PhotoFolder, plain
 from sagesplat.scene.images import has_alpha, photo_size
-from sagesplat.scene.loading import MAX_SIDE, MIN_VIEWS, camera_of, check_settings
+from sagesplat.scene.loading import (
+    MAX_SIDE,
+    MIN_VIEWS,
+    Fisheye,
+    at_downscale,
+    check_found,
+    check_settings,
+    describe_lenses,
+    describe_photos,
+    views_of,
+)
 from sagesplat.scene.points import random_points, read_points
 from sagesplat.scene.scene import Camera, Lens, Scene, View
-from sagesplat.scene.undistort import is_pinhole, pinhole
+from sagesplat.scene.undistort import SPHERE, pinhole
 
-PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-FISHEYE = "OPENCV_FISHEYE"
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")  # tried if a file_path has none
+# Camera models by the names that nerfstudio, its converters and instant-ngp give them. What they mean is told
+# by the coefficients: of the perspective ones k1 ... k3, p1, p2, of the fisheye ones k1 ... k4.
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE")
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+ARIA = "FISHEYE624"  # of Project Aria, with distortion_params: COLMAP's RAD_TAN_THIN_PRISM_FISHEYE
+SPHERES = (SPHERE, "SPHERICAL")
+NO_PIXELS = 1e-2  # what a coefficient may move the corners of a photo by, to be taken for zero
 LARGEST = 1e9  # largest number accepted; float32 is too coarse beyond
+SMALLEST = 1e-6  # scale of a camera
 MAX_SHEAR = 1e-2  # largest |R^T R - I| that rounding explains
 BLENDER_CUBE = 1.3  # half the side of the cube that NeRF's Blender scenes fit into (3DGS's initial points)
 WHITE = (255, 255, 255)
 _CURE = "give a folder with a complete transforms file"
-_Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)] | None
+_Given = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+_Number = _Given | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +97,7 @@ class _Frame(Pose):
     k4: _Number = None
     p1: _Number = None
     p2: _Number = None
+    distortion_params: Annotated[list[_Given], Meta(max_length=100)] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +112,13 @@ class _Transforms:
 
 
 def load_transforms(
-    path: Path, *, downscale: int = 1, test_every: int = 8, content: dict[str, Any] | None = None
+    path: Path,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    images: Path | None = None,
+    fisheye: Fisheye = "crop",
+    content: dict[str, Any] | None = None,
 ) -> Scene:
     """The scene of nerfstudio's or instant-ngp's transforms.json; `path` is the file or its folder.
 
@@ -103,7 +127,8 @@ def load_transforms(
     the split unless `test_every` is 0: `val` is used only without `test`, and unlisted frames are dropped.
     Points are read from `ply_file_path`, else made by `points.random_points`. They are in the frame of the
     poses: `applied_transform` has been applied to both. A frame's `mask_path` says which pixels count (not
-    black). Depths are not read. `content`: of a file of another format, in place of what `path` holds. Raises
+    black). Depths are not read. Photos are found by `find_photos`, in the folder or in `images`; frames whose
+    photo is gone are left out. `content`: of a file of another format, in place of what `path` holds. Raises
     SceneError.
     """
     file = path if path.suffix == ".json" or content else path / "transforms.json"
@@ -111,20 +136,24 @@ def load_transforms(
     transforms, frames = _read(file, content)
     offset, points = offset_of(_positions(frames)), None
     if transforms.ply_file_path is not None:
-        ply = file.parent / _inside(file, "ply_file_path", transforms.ply_file_path)
+        ply = _points_file(file, transforms.ply_file_path)
         points = read_points(ply, offset)
         if any(offset) and not any(offset_of(_positions(frames), points.xyz + np.array(offset))):
             offset, points = NO_OFFSET, read_points(ply)  # cameras that hardly moved, in a wide scene
     frames = _moved(frames, offset)
-    views = _views(file, frames, downscale)
-    test_names = None
+    by_frame, notes = _views(file, frames, downscale, images, fisheye)
+    views, test_names = [view for _, of_frame in by_frame for view in of_frame], None
     if test_every:
-        views, test_names = _listed_split(file, transforms, frames, views)
-    views = _sorted(file, views, test_names)
-    points = random_points(views) if points is None else points
+        views, test_names = _listed_split(file, transforms, frames, by_frame)
+    ordered = _sorted(file, views, test_names)
+    if points is None:
+        points = random_points(ordered)
+        notes.append(f"no points: training begins with {len(points.xyz):,} random ones that cameras see")
     folder = file.parent
-    name = repaired(folder.resolve().name)
-    return Scene(name, folder, views, points, test_every, test_names=test_names, offset=offset)
+    return Scene(
+        repaired(folder.resolve().name), folder, ordered, points, test_every, test_names=test_names,
+        notes=(*notes, *describe_lenses(ordered)), offset=offset,
+    )  # fmt: skip
 
 
 def _positions(frames: Sequence[Pose]) -> Float64[np.ndarray, "V 3"]:
@@ -148,7 +177,14 @@ def _moved(frames: list[_Frame], offset: Position) -> list[_Frame]:
     return moved
 
 
-def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scene:
+def load_blender(
+    path: Path,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    images: Path | None = None,
+    fisheye: Fisheye = "crop",
+) -> Scene:
     """The scene of a NeRF Blender folder: transforms_train.json, and transforms_test.json or else _val.
 
     The train file's views are training views and the test file's are test views, as in 3DGS. With
@@ -161,15 +197,21 @@ def load_blender(path: Path, *, downscale: int = 1, test_every: int = 8) -> Scen
     tests = next(
         (f for f in (folder / "transforms_test.json", folder / "transforms_val.json") if f.is_file()), None
     )
-    views = _views(train, _read(train)[1], downscale)
-    test_views = _views(tests, _read(tests)[1], downscale) if tests else []
+    by_frame, notes = _views(train, _read(train)[1], downscale, images, fisheye)
+    views, test_views = [view for _, of_frame in by_frame for view in of_frame], []
+    if tests:
+        by_frame, more = _views(tests, _read(tests)[1], downscale, images, fisheye)
+        test_views = [view for _, of_frame in by_frame for view in of_frame]
+        notes = [f"{file.name}: {note}" for file, said in ((train, notes), (tests, more)) for note in said]
     test_names = frozenset(view.name for view in test_views) if tests and test_every else None
-    views = _sorted(train, [*views, *test_views], test_names)
-    if has_alpha(views[0].image_path):
-        views = tuple(replace(view, camera=replace(view.camera, background=WHITE)) for view in views)
-    points = random_points(views, cube=BLENDER_CUBE)
-    name = repaired(folder.resolve().name)
-    return Scene(name, folder, views, points, test_every, test_names=test_names, alpha="background")
+    ordered = _sorted(train, [*views, *test_views], test_names)
+    if has_alpha(ordered[0].image_path):
+        ordered = tuple(replace(view, camera=replace(view.camera, background=WHITE)) for view in ordered)
+    points = random_points(ordered, cube=BLENDER_CUBE)
+    return Scene(
+        repaired(folder.resolve().name), folder, ordered, points, test_every, test_names=test_names,
+        alpha="background", notes=tuple(notes),
+    )  # fmt: skip
 
 
 def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool, Position]:
@@ -181,22 +223,23 @@ def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool, Position]
     _, frames = _read(file)
     offset = offset_of(_positions(frames))
     frames = _moved(frames, offset)
-    found, photos = [], []
-    for number, frame in enumerate(frames):
-        name = frame.file_path or f"{number:03}"
+    names = [_written(file, "file_path", frame.file_path or f"{i:03}") for i, frame in enumerate(frames)]
+    photos = PhotoFolder(file.parent).find(names)
+    found = []
+    for name, frame in zip(names, frames, strict=True):
         try:
-            path = _inside(file, "file_path", name)
-            photos.append(_photo(file.parent, path))
-            if photos[-1] is None and (frame.w is None or frame.h is None):
+            if (photo := photos.files.get(name)) is None and (frame.w is None or frame.h is None):
                 raise ValueError("neither w and h nor its photo")
-            lens = _lens(frame, photos[-1] or file)
+            lens = _lens(frame, file.parent / photo if photo else file)
+            if lens.model == SPHERE:
+                raise ValueError("a photo of 360 degrees is no single view; give the folder with its photos")
             K = pinhole(lens).astype(np.float32)
             w2c = frame.world_to_camera().astype(np.float32)
         except ValueError as error:
             cure = "export the transforms again"
             raise SceneError(f"{file}: frame {short(repr(name))}: {short(error)}; {cure}") from None
         found.append((name, Camera(w2c, K, lens.width, lens.height)))
-    return found, None not in photos, offset
+    return found, not photos.missing, offset
 
 
 def _read(file: Path, content: dict[str, Any] | None = None) -> tuple[_Transforms, list[_Frame]]:
@@ -216,101 +259,117 @@ def _read(file: Path, content: dict[str, Any] | None = None) -> tuple[_Transform
     return transforms, frames
 
 
-def _inside(file: Path, key: str, value: Any) -> PurePosixPath:
-    """`value` as a path relative to the file's folder; SceneError if it leads outside."""
-    path = PurePosixPath(value.replace("\\", "/")) if isinstance(value, str) else None
-    if path is None or not path.name or "\0" in path.name:
+def _written(file: Path, key: str, value: Any) -> str:
+    """A path as a transforms file has it; SceneError for one that no photo can have."""
+    name = plain(value) if isinstance(value, str) else ""
+    if not name.strip("/.") or "\0" in name:
         raise SceneError(f"{file}: {key} is {str(value)[:80]!r}; name a file relative to the folder")
-    if path.is_absolute() or ".." in path.parts:
-        raise SceneError(
-            f"{file}: {key} {value[:80]!r} is outside the folder; move it there and name it relative to it"
-        )
     try:
-        check_photo(path.as_posix())
+        check_photo(name.lstrip("/."))
     except ValueError as error:
         raise SceneError(f"{file}: {key} {short(repr(value))}: {error}; rename the file, and here") from None
-    return path
+    return value
 
 
-def _views(file: Path, frames: Sequence[_Frame], downscale: int) -> list[View]:
-    """The views of the frames, in order; names are relative to images/ if all photos are in it."""
-    folder = file.parent
-    paths = [_inside(file, "file_path", frame.file_path) for frame in frames]
-    if all(path.parts[0] == "images" and len(path.parts) > 1 for path in paths):
-        folder, paths = folder / "images", [path.relative_to("images") for path in paths]
-    small = file.parent / f"images_{downscale}"
-    shipped = folder != file.parent and downscale > 1 and small.is_dir()
-    root, divisor = (small, 1) if shipped else (folder, downscale)
-    photos = [_photo(root, path) for path in paths]
-    missing = [path for path, photo in zip(paths, photos, strict=True) if photo is None]
-    if missing:
-        raise SceneError(
-            f"{root}: {len(missing)} of the {len(paths)} photos of {file.name} are missing, first "
-            f"{short(repr(str(missing[0])))}; add the files, or remove their frames"
-        )
-    views = []
-    for frame, path, photo in zip(frames, paths, photos, strict=True):
-        assert photo is not None
+def _points_file(file: Path, value: Any) -> Path:
+    """The file of `ply_file_path`, at the end of the path of another machine, too, but never outside."""
+    parts = [
+        part for part in plain(_written(file, "ply_file_path", value)).split("/") if part not in ("", "..")
+    ]
+    places = [file.parent.joinpath(*parts[start:]) for start in range(len(parts))]
+    return next((place for place in places if os.path.isfile(place)), places[0])
+
+
+def _views(
+    file: Path, frames: Sequence[_Frame], downscale: int, images: Path | None, fisheye: Fisheye
+) -> tuple[list[tuple[str, list[View]]], list[str]]:
+    """Of each frame whose photo is there its file_path and its views; and what is to be said about them.
+
+    Names are relative to images/ if all photos are in it.
+    """
+    written = [_written(file, "file_path", frame.file_path) for frame in frames]
+    root = images or file.parent
+    photos = PhotoFolder(root).find(written)
+    check_found(photos, file.name)
+    if images is None and all(name.startswith("images/") for name in photos.files.values()):
+        root = root / "images"
+        files = {name: found.removeprefix("images/") for name, found in photos.files.items()}
+        photos = Found(root, written, files, prefix="images/")
+    sized, divisor = at_downscale(photos, downscale)
+    there = [frame for frame, name in zip(frames, written, strict=True) if name in photos.files]
+    masks = _masks(file, there)
+    by_frame: list[tuple[str, list[View]]] = []
+    scales: list[float] = []
+    for frame, name in zip(frames, written, strict=True):
+        if (below := photos.files.get(name)) is None:
+            continue
         try:
-            original = (_photo(folder, path) or photo) if shipped else photo
-            lens = _lens(frame, original)
-            K = pinhole(lens)
-            w2c = frame.world_to_camera()
-            valid = _mask(file, frame)
+            lens, w2c = _lens(frame, root / below), frame.world_to_camera()
+            valid = None if frame.mask_path is None else masks[frame.mask_path]
+            views = views_of(below, sized[name], w2c, lens, divisor, fisheye, valid)
         except ValueError as error:
             reason = short(error)
-            raise SceneError(f"{file}: frame {str(path)!r}: {reason}; export the transforms again") from None
-        camera = camera_of(photo, w2c, lens, K, divisor)
-        name = photo.relative_to(root).as_posix()
-        views.append(View(name, camera, photo, None if is_pinhole(lens) else lens, valid))
-    return views
+            raise SceneError(
+                f"{file}: frame {short(repr(name))}: {reason}; export the transforms again"
+            ) from None
+        by_frame.append((name, views))
+        if frame.transform_matrix is not None:
+            scales.append(float(np.linalg.norm(frame.transform_matrix[:3, 0])))
+    notes = describe_photos(photos)
+    if np.abs(np.subtract(scales, 1)).max() > MAX_SHEAR:
+        notes.append(f"the axes of the poses are {np.median(scales):.3g} long; their scale is left out")
+    return by_frame, notes
 
 
-def _mask(file: Path, frame: _Frame) -> Path | None:
-    """The image that says which pixels of a frame's photo count. Raises ValueError where it is missing."""
-    if frame.mask_path is None:
-        return None
-    path = file.parent / _inside(file, "mask_path", frame.mask_path)
-    if not path.is_file():
-        raise ValueError(f"no file {short(repr(frame.mask_path))}, its mask_path")
-    return path
-
-
-def _photo(root: Path, path: PurePosixPath) -> Path | None:
-    """A frame's file; Blender scenes leave its suffix out of the file_path."""
-    photos = (root / path.parent / f"{path.name}{suffix}" for suffix in ("", *SUFFIXES))
-    return next((photo for photo in photos if os.path.isfile(photo)), None)  # False for impossible names
+def _masks(file: Path, frames: Sequence[_Frame]) -> dict[str, Path]:
+    """The images that say which pixels of photos count, by mask_path. SceneError where one is missing."""
+    names = [_written(file, "mask_path", f.mask_path) for f in frames if f.mask_path is not None]
+    found = PhotoFolder(file.parent, all_folders=True).find(names)
+    if found.missing:
+        first = short(repr(found.missing[0]))
+        raise SceneError(
+            f"{file}: {len(found.missing)} of {len(names)} masks are missing, first {first}; add the files, "
+            "or remove mask_path"
+        )
+    return {name: file.parent / below for name, below in found.files.items()}
 
 
 def _lens(frame: _Frame, photo: Path) -> Lens:
     """A frame's lens as a COLMAP camera model; `photo` gives the size if the frame does not.
 
     With k3, OPENCV becomes COLMAP's FULL_OPENCV. k4 is accepted for the fisheye only, since other models
-    define it differently. Raises ValueError.
+    define it differently; one that moves no pixel is none. Raises ValueError.
     """
-    model = frame.camera_model or (FISHEYE if frame.is_fisheye else "OPENCV")
-    if model not in (*PERSPECTIVE, FISHEYE):
-        known = ", ".join((*PERSPECTIVE, FISHEYE))
-        raise ValueError(f"camera_model {model[:40]!r} is not one of {known}")
+    model = (frame.camera_model or (FISHEYE[0] if frame.is_fisheye else "OPENCV")).upper()
+    if model not in (*PERSPECTIVE, *FISHEYE, *SPHERES, ARIA):
+        known = ", ".join((*PERSPECTIVE, *FISHEYE, ARIA, SPHERE))
+        raise ValueError(f"camera_model {short(repr(model))} is not one of {known}")
     if frame.w is None or frame.h is None:
         width, height = photo_size(photo)
     else:
         width, height = round(frame.w), round(frame.h)
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
         raise ValueError(f"size {width} x {height} is out of range")
+    if model in SPHERES:  # the photo is the whole sphere, whatever its focal length is said to be
+        return Lens(SPHERE, (float(width), float(height)), width, height)
     fx = _focal(frame.fl_x, frame.camera_angle_x, width)
     fy = _focal(frame.fl_y, frame.camera_angle_y, height)
     fx, fy = fx or fy, fy or fx
     if fx is None or fy is None:
         raise ValueError("neither fl_x nor camera_angle_x")
     cx, cy = (width / 2 if frame.cx is None else frame.cx), (height / 2 if frame.cy is None else frame.cy)
+    params = (fx, fy, cx, cy)
+    if model == ARIA:
+        if len(given := frame.distortion_params or ()) != 12:
+            raise ValueError(f"{ARIA} has 12 distortion_params, not {len(given)}")
+        return Lens("RAD_TAN_THIN_PRISM_FISHEYE", (*params, *given), width, height)
     given = (frame.k1, frame.k2, frame.k3, frame.k4, frame.p1, frame.p2)
     k1, k2, k3, k4, p1, p2 = (0.0 if value is None else value for value in given)
-    params = (fx, fy, cx, cy)
-    if model == FISHEYE and not (p1 or p2):
-        return Lens(FISHEYE, (*params, k1, k2, k3, k4), width, height)
-    if model == FISHEYE or k4:
-        raise ValueError(f"{model} has no {'p1 and p2' if model == FISHEYE else 'k4'}")
+    if model in FISHEYE and not (p1 or p2):
+        return Lens(FISHEYE[0], (*params, k1, k2, k3, k4), width, height)
+    corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
+    if model in FISHEYE or abs(k4) * corner**9 * max(fx, fy) > NO_PIXELS:
+        raise ValueError(f"{model} has no {'p1 and p2' if model in FISHEYE else 'k4'}")
     if k3:
         return Lens("FULL_OPENCV", (*params, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), width, height)
     return Lens("OPENCV", (*params, k1, k2, p1, p2), width, height)
@@ -336,9 +395,13 @@ def world_to_camera(c2w: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndar
     if len(c2w) == 4 and np.abs(c2w[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise ValueError("the last row of transform_matrix is not 0 0 0 1 (is it transposed?)")
     axes = c2w[:3, :3]
+    length = np.sqrt(
+        (axes * axes).sum() / 3
+    )  # of all three: the scale of the camera's node, which turns nothing
+    axes = axes / (length if length > SMALLEST else 1)
     shear = np.abs(axes.T @ axes - np.eye(3)).max()
     if shear > MAX_SHEAR:
-        lengths = ", ".join(f"{length:.3g}" for length in np.linalg.norm(axes, axis=0))
+        lengths = ", ".join(f"{each:.3g}" for each in np.linalg.norm(c2w[:3, :3], axis=0))
         raise ValueError(f"transform_matrix is no rotation (axes {lengths} long); apply the camera's scale")
     if np.linalg.det(axes) < 0:
         raise ValueError("transform_matrix is a reflection (left-handed axes)")
@@ -350,7 +413,7 @@ def world_to_camera(c2w: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndar
 
 
 def _listed_split(
-    file: Path, content: _Transforms, frames: Sequence[_Frame], views: list[View]
+    file: Path, content: _Transforms, frames: Sequence[_Frame], by_frame: Sequence[tuple[str, list[View]]]
 ) -> tuple[list[View], frozenset[str] | None]:
     """The views that the file's lists name, and the names of the test views (None without lists)."""
     lists = {
@@ -358,21 +421,24 @@ def _listed_split(
         for kind in ("train", "test", "val")
         if (names := getattr(content, f"{kind}_filenames")) is not None
     }
+    views = [view for _, of_frame in by_frame for view in of_frame]
     if not lists:
         return views, None
-    paths = [_inside(file, "file_path", frame.file_path) for frame in frames]
-    name_of = {path: view.name for path, view in zip(paths, views, strict=True)}
+    of_frames = {plain(name): {view.name for view in of_frame} for name, of_frame in by_frame}
+    every = {plain(frame.file_path or "") for frame in frames}
     names: dict[str, set[str]] = {}
     for kind, given in lists.items():
-        listed = [_inside(file, f"{kind}_filenames", path) for path in given]
-        unknown = [path for path in listed if path not in name_of]
+        listed = [plain(_written(file, f"{kind}_filenames", name)) for name in given]
+        unknown = [name for name in listed if name not in every]
         if not listed or unknown:
-            first = f", first {short(repr(str(unknown[0])))}" if unknown else ""
+            first = f", first {short(repr(unknown[0]))}" if unknown else ""
             raise SceneError(
                 f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame{first}; "
                 "list the file_path of frames, or leave the list out"
             )
-        names[kind] = {name_of[path] for path in listed}
+        names[kind] = set().union(
+            *(of_frames.get(name, ()) for name in listed)
+        )  # none of a photo that is gone
     every = {view.name for view in views}
     tests = names.get("test") or names.get("val") or every - names["train"]
     train = names.get("train") or every - tests

@@ -19,6 +19,11 @@ GREY = 128
 FAR = 10.0  # random points reach this many times as far as the volume that the cameras span
 NEIGHBOURS = 4  # views, at least one of which must also see a random point
 COLOUR_VIEWS, COLOUR_SIDE = 16, 128  # photos that colour random points; their longer side, px
+HARMONIC = 0.5 / np.sqrt(np.pi)  # value of the constant spherical harmonic
+_OF_SPLATS = ("f_dc_0", "f_dc_1", "f_dc_2")
+_COLOURS = (
+    ("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"), _OF_SPLATS,
+)  # fmt: skip
 FULL = {"f4": 255.0, "f8": 255.0, "u2": 1 / 257}  # scale to 0 ... 255 by type of colour property
 
 
@@ -30,15 +35,16 @@ def untracked(xyz: Float32[np.ndarray, "P 3"], rgb: UInt8[np.ndarray, "P 3"]) ->
 def read_points(path: Path, offset: Position = geometry.NO_OFFSET) -> Points:
     """The vertices of a PLY file, ASCII or binary of either byte order: x y z, and red green blue or grey.
 
-    Colours are whole numbers up to 255 (65535 in 16 bits), or floats up to 1. Points without colours
-    are grey. `offset` is subtracted from the positions before they become float32. Raises SceneError.
+    Colours are whole numbers up to 255 (65535 in 16 bits), or floats up to 1, or up to 255 where one is above
+    1; they may be named r g b or diffuse_red, and be the f_dc of a splat. Points without colours are grey.
+    `offset` is subtracted from the positions before they become float32. Raises SceneError.
     """
     try:
         with path.open("rb") as file:
             header = read_header(file)
-            if header.count < 1 or not {"x", "y", "z"} <= header.types.keys():
+            if header.count < 1 or not {"x", "y", "z"} <= {name.lower() for name in header.types}:
                 raise ValueError("its header names no vertices or no x, y and z")
-            table = read_vertices(path, file, header)
+            table = {name.lower(): values for name, values in read_vertices(path, file, header).items()}
     except FileNotFoundError:
         raise SceneError(
             f"{path}: no such file; add it, or remove ply_file_path to start from random points"
@@ -52,10 +58,20 @@ def read_points(path: Path, offset: Position = geometry.NO_OFFSET) -> Points:
         if bad := int(np.count_nonzero(~np.isfinite(xyz).all(axis=1))):
             raise SceneError(f"{path}: {bad} of {len(xyz)} points are not finite; export the points again")
         rgb = np.full((len(xyz), 3), GREY, np.uint8)
-        for column, name in enumerate(("red", "green", "blue")):
-            if name in table:
-                scale = FULL.get(header.types[name], 1.0)
-                rgb[:, column] = np.nan_to_num(table[name] * scale).round().clip(0, 255)
+        types = {name.lower(): kind for name, kind in header.types.items()}
+        for names in _COLOURS:
+            if table.keys() >= set(names):
+                values = np.stack([table[name] for name in names], axis=1).astype(float)
+                if names[0] == "f_dc_0":
+                    values = values * HARMONIC + 0.5
+                scale = FULL.get(types[names[0]], 1.0)
+                scale = (
+                    1.0
+                    if scale == 255 and np.nanmax(values, initial=0) > 1 and names != _OF_SPLATS
+                    else scale
+                )
+                rgb[:] = np.nan_to_num(values * scale).round().clip(0, 255)
+                break
     return untracked(xyz, rgb)
 
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
 import numpy as np
@@ -57,6 +57,9 @@ class Camera:
         return self.resized(max(1, round(self.width * share)), max(1, round(self.height * share)))
 
 
+Face = Literal["front", "right", "back", "left", "up", "down"]  # of the cube around a wide lens
+
+
 @dataclass(frozen=True)
 class Lens:
     """A COLMAP camera model with its parameters: `images.load_photo` undistorts photos by it."""
@@ -65,6 +68,7 @@ class Lens:
     params: tuple[float, ...]  # in COLMAP's order, pixels of width x height (the file may be smaller)
     width: int
     height: int
+    face: Face | None = None  # the view shows this face of the cube around the lens; None: straight ahead
 
 
 STEEPEST = 10.0  # magnitude of a coefficient of a vignetting
@@ -97,6 +101,14 @@ class View:
     lens: Lens | None = None  # None: the file on disk needs no undistortion
     valid_path: Path | None = None  # an image of the photo's shape whose black pixels do not count
     vignetting: Vignetting | None = None  # of the photo, to be taken out of it
+
+    @property
+    def photo_name(self) -> str:
+        """Name of the whole photo, where the view is one face of the cube around its lens."""
+        if self.lens is None or self.lens.face is None:
+            return self.name
+        path = PurePosixPath(self.name)
+        return path.with_name(path.stem.removesuffix(f"_{self.lens.face}") + path.suffix).as_posix()
 
 
 @dataclass(frozen=True, eq=False)

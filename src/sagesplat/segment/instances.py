@@ -76,10 +76,10 @@ def import_instances(scene: Scene, masks: Path, target: Path) -> int:
     segments = panoptic_segments(masks)
     raw, found = raw_photos(scene.path), 0
     for view in scene.views:
-        path = given_png(folder, view.name)
+        path = given_png(folder, view.photo_name)
         if path is not None:
             instances = read_instances(path)
-        elif segments is not None and (given := segments(view.name)) is not None:
+        elif segments is not None and (given := segments(view.photo_name)) is not None:
             path, instances = given[0], _renumbered(given[1], 0, given[0])
         else:
             continue

@@ -52,7 +52,7 @@ def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
     if source.resolve() == target.resolve():
         raise LabelError(f"{source}: these are the masks of the run itself; name the folder they came from")
     taxonomy, find = _source(source)
-    found = {view.name: find(view.name) for view in scene.views}
+    found = {view.name: find(view.photo_name) for view in scene.views}
     missing = [name for name, file in found.items() if file is None]
     if len(missing) == len(scene.views):
         raise LabelError(

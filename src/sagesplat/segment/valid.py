@@ -1,7 +1,8 @@
 """Pixels that count: what does not belong to a scene is not trained on, not measured and has no vote.
 
 Pixels do not count where a category is ignored, where a mask of the photo is black (`scene.given_masks`, the
-`mask_path` of nerfstudio), and where a photo is transparent and that means it (`Scene.alpha`).
+`mask_path` of nerfstudio), where a photo is transparent and that means it (`Scene.alpha`), and where the face
+of a cube is beyond what a fisheye saw.
 """
 
 import shutil
@@ -20,6 +21,7 @@ from sagesplat.scene.given_masks import INVERTED_FOLDER, GivenMask, GivenMasks
 from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
 from sagesplat.scene.raw_photos import RawPhoto, raw_photos
 from sagesplat.scene.scene import Scene, View
+from sagesplat.scene.undistort import seen
 from sagesplat.segment.fit import fit
 from sagesplat.segment.masks import CACHE_BYTES, Masks, mask_path
 
@@ -114,6 +116,8 @@ def write_valid(
             valid &= ~np.isin(label_ids[view], np.array(sorted(ignore), np.int16))
         if transparent:
             valid &= opaque(view)
+        if view.lens is not None and view.lens.face is not None:
+            valid &= seen(view.lens, view.camera.K, view.camera.width, view.camera.height)
         if not valid.all():
             if dilation:
                 valid = np.asarray(minimum_filter(valid, 2 * dilation + 1, mode="nearest"))
@@ -139,7 +143,8 @@ class _Given:
     def __init__(self, scene: Scene, folder: Path | None):
         masks = given_masks(scene, folder)
         self.raw = raw_photos(scene.path) if masks else {}
-        self.found = {view.name: mask for view in scene.views if (mask := masks.of(view.name)) is not None}
+        found = ((view.name, masks.of(view.photo_name)) for view in scene.views)
+        self.found = {name: mask for name, mask in found if mask is not None}
         # structure from motion may have left out all photos with a mask, and wrote the folder itself
         named = any(view.valid_path for view in scene.views)  # by their capture, whatever they are called
         if masks.folders and not self.raw and not self.found and not named:
@@ -199,7 +204,7 @@ def describe_masks(scene: Scene) -> str:
 def given_masks(scene: Scene, folder: Path | None = None) -> GivenMasks:
     """The masks that lie beside the photos of a scene, or in `folder`."""
     view = scene.views[0]
-    photos = view.image_path.parents[view.name.count("/")]
+    photos = view.image_path.parents[view.photo_name.count("/")]
     return GivenMasks([scene.path, photos.parent], photos, folder)
 
 

@@ -45,7 +45,7 @@ from sagesplat.segment.masks import (
 from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.stages.edited import check_not_edited
 from sagesplat.stages.label import edit_of, make_masks
-from sagesplat.stages.scene import check_folder, open_scene
+from sagesplat.stages.scene import check_folder, open_scene, reading
 from sagesplat.train.votes import vote
 from sagesplat.viewer.frames import FLIP, upward
 
@@ -74,7 +74,10 @@ def open_splat(
     own = job.run.capture / repaired(source.resolve().stem)
     photos = _make_capture(job, source, own, config, scene, labelled=not segmented)
     offset = tuple(read_more(job.run.adopted, "offset").astype(float).tolist())
-    open_scene(job, config.cameras if photos and config.cameras else own, scene, offset=offset)
+    if photos and config.cameras:
+        open_scene(job, config.cameras, scene, offset=offset)
+    else:  # its photos are the renders
+        open_scene(job, own, replace(scene, images=None, fisheye="crop"), offset=offset)
     if not segmented:
         masks = replace(masks, masks=own / "masks")
     make_masks(job, masks, labels)
@@ -100,11 +103,11 @@ def _make_capture(
     Returns whether there are photos.
     """
     run = job.run
-    given = [] if config.cameras is None else read_camera_file(config.cameras)
+    given = [] if config.cameras is None else read_camera_file(config.cameras, scene.images)
     photos = bool(given) and all(one.photo is not None for one in given)
     names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "spz_axes", "seed")
     settings = {name: getattr(config, name) for name in names} | {"labelled": labelled, "photos": photos}
-    settings["downscale"] = scene.downscale
+    settings |= {name: reading(scene)[name] for name in ("downscale", "images", "fisheye")}
     settings["cameras"] = config.cameras and str(config.cameras.resolve())
     settings |= {"source": str(source.resolve()), "content": _content(source)}
 
@@ -121,7 +124,7 @@ def _make_capture(
         left_out = "".join(f", {count:,} left out ({reason})" for reason, count in splat.dropped.items())
         g = splat.gaussians
         if photos and config.cameras:
-            views = list(load_scene(config.cameras, **asdict(scene)).views)
+            views = list(load_scene(config.cameras, **reading(scene)).views)
             cameras = [view.camera for view in views]
             up, how = upward(cameras) * FLIP, f"those of {config.cameras}"
         else:

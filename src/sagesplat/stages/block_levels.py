@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sagesplat.adapt.ladder import read_prefixes
-from sagesplat.core.config import BlocksConfig, NestConfig
+from sagesplat.core.config import NestConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, named
 from sagesplat.core.gaussians import Gaussians
@@ -38,8 +38,10 @@ from sagesplat.train.boundaries import (
 )
 from sagesplat.train.nested import Nested, NestStep
 
+_BOUNDARY = 8  # steps of the levels for each step of boundary tuning
 
-def nest_scene(job: Job, nest: NestConfig, config: BlocksConfig, seed: int) -> None:
+
+def nest_scene(job: Job, nest: NestConfig, seed: int) -> None:
     """Make the nested levels of the scene as one, or of its blocks: tuned along the boundaries and merged."""
     check_not_adopted(job.run)
     if not job.has_blocks:
@@ -47,7 +49,8 @@ def nest_scene(job: Job, nest: NestConfig, config: BlocksConfig, seed: int) -> N
     run, file = job.run, job.run.division
     check_limits(nest, "nest.")
     blocks = read_blocks(file)
-    settings = {**asdict(nest), "seed": seed, "boundary_steps": config.boundary_steps}
+    settings = {**asdict(nest), "seed": seed}
+    steps = nest.steps // _BOUNDARY
 
     def make() -> list[str]:
         every = range(len(blocks))
@@ -59,14 +62,14 @@ def nest_scene(job: Job, nest: NestConfig, config: BlocksConfig, seed: int) -> N
         ]
         results(job.executor, tasks, job.emit)
         files = [run.block(number).interior for number in every]
-        if config.boundary_steps:
-            files = _tune(job, blocks, config, nest, seed)
+        if steps:
+            files = _tune(job, blocks, replace(nest, steps=steps), seed)
         else:  # the table of blocks would show the seconds of an earlier tuning
             for number in every:
                 run.block(number).provenance("boundaries").unlink(missing_ok=True)
         merged = together(files)
         lines = write_ladder(job, merged.gaussians, merged.sizes, nest, merged.second)
-        return [*lines, f"{len(blocks)} blocks, {config.boundary_steps} steps of boundary tuning each"]
+        return [*lines, f"{len(blocks)} blocks, {steps} steps of boundary tuning each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
@@ -98,18 +101,17 @@ def nest_block(
     run_stage(job, "interior", {}, inputs, [run.interior], make)
 
 
-def _tune(job: Job, blocks: Blocks, config: BlocksConfig, nest: NestConfig, seed: int) -> list[Path]:
+def _tune(job: Job, blocks: Blocks, nest: NestConfig, seed: int) -> list[Path]:
     """Tune the blocks along their boundaries, neighbours one after the other; the files with the results."""
     run, every = job.run, range(len(blocks))
     files = [run.block(number).interior for number in every]
     colour, sees = graph_colouring(blocks.neighbours()), read_division(run.division).sees
-    steps = replace(nest, steps=config.boundary_steps)
     for now in range(int(colour.max()) + 1):
         mine = [number for number in every if colour[number] == now]
         tasks = []
         for number in mine:
             others = [files[other] for other in sees[number] if other != number]
-            what = (job.block_spec(number), run.division, number, others, steps, seed)
+            what = (job.block_spec(number), run.division, number, others, nest, seed)
             tasks.append(Task(f"boundaries of block {number}", tune_boundaries, what, job.gpus))
         results(job.executor, tasks, job.emit)
         for number in mine:

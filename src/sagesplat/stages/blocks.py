@@ -59,15 +59,10 @@ def check(config: BlocksConfig, train: TrainConfig) -> None:
         raise RunError("--train.outliers does not go with --blocks.count; leave out one of them")
 
 
-def _division(config: BlocksConfig) -> dict[str, float]:
-    """The settings that decide what a block is trained on."""
-    return {name: value for name, value in asdict(config).items() if name != "boundary_steps"}
-
-
 def divide(job: Job, config: BlocksConfig, seed: int) -> Blocks:
     """Split the scene, and create a run folder for each block with its part of the capture."""
     run, file = job.run, job.run.division
-    settings = {**_division(config), "seed": seed}
+    settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
         scene = job.scene
@@ -160,7 +155,7 @@ def train_scene(job: Job, train: TrainConfig, config: BlocksConfig, seed: int) -
     train = replace(train, exposure="off", sky="off")
     run = job.run
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
-    settings["blocks"] = _division(config)
+    settings["blocks"] = asdict(config)
     blocks = divide(job, config, seed)
     parts = BlockCategories(job.masks.taxonomy, len(blocks))
 

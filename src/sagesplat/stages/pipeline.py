@@ -84,7 +84,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     if job.run.ladder == "nested":
         if not job.has_blocks:
             clean_levels(job, config.clean)
-        nest_scene(job, config.nest, config.blocks, config.seed)
+        nest_scene(job, config.nest, config.seed)
     measure_and_plan(job, config)
 
 

@@ -21,6 +21,8 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene import load_scene
 from sagesplat.scene.detect import detect
 from sagesplat.scene.feature_masks import OfPhoto
+from sagesplat.scene.find_model import model_folders
+from sagesplat.scene.find_photos import PHOTO_FOLDERS
 from sagesplat.scene.given_masks import holds_masks
 from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
@@ -29,6 +31,8 @@ from sagesplat.segment.mask_files import label_images_of
 from sagesplat.stages.edited import check_not_edited
 
 _CPU_PIXELS = 1.25e6  # of a photo: a training step's time and the cap of Gaussians grow with them
+# VisualSFM, Bundler, OpenSfM, OpenMVG, Meshroom, Metashape.
+_POSES_OF_OTHERS = (".nvm", "bundle.out", "reconstruction.json", "sfm_data.json", ".sfm", "cameras.xml")
 _SHARES = {1: "all", 2: "half", 4: "a quarter", 8: "an eighth"}  # of a photo's width
 
 
@@ -72,19 +76,27 @@ def open_scene(
     run = job.run
     check_folder(run)
     if detect(path) in ("photos", "video"):
+        if config.images is not None:
+            raise RunError(
+                f"{path}: no poses for the photos of --images; give the folder that has them, or leave out "
+                "--images"
+            )
+        if unread := _unread_poses(path):
+            job.emit(Warned(f"{unread}; poses are estimated anew"))
         capture = run.capture / repaired(path.resolve().stem)  # the scene will have that name
         leaving_out = _LeavingOut(config, masks or MasksConfig(), labels or LabelsConfig())
         _find_poses(job, path, capture, poses or PosesConfig(), leaving_out)
         path = capture
     begun = _begun(job)
     if not config.downscale:
-        config = replace(config, downscale=_downscale(job, path, begun))
-    same = begun and not job.force and begun.settings == asdict(config)
+        config = replace(config, downscale=_downscale(job, path, config, begun))
+    reads = reading(config)
+    same = begun and not job.force and begun.settings == reads
     again = begun and same and begun.path == path.resolve()  # what was found in the photos is known
-    scene = begun.load() if begun and again else load_scene(path, **asdict(config))
+    scene = begun.load() if begun and again else load_scene(path, **reads)
     scene = scene if any(scene.offset) else replace(scene, offset=offset)
     photos, found = photo_hashes(run.photo_hashes, scene), scene.views[0].vignetting
-    settings = {"path": str(path.resolve()), **asdict(config), "fingerprint": fingerprint(scene)}
+    settings = {"path": str(path.resolve()), **reads, "fingerprint": fingerprint(scene)}
     settings["photos"] = photos.digest
     if begun and same:
         check_photos(scene, begun.photos, photos.sha256)
@@ -94,7 +106,7 @@ def open_scene(
             run.scene,
             {
                 "path": str(path.resolve()),
-                "settings": asdict(config),
+                "settings": reads,
                 "fingerprint": settings["fingerprint"],
                 "photos": photos.sha256,
                 "vignetting": found and asdict(found),
@@ -132,13 +144,33 @@ def open_scene(
     photos.keep()
 
 
-def _downscale(job: Job, path: Path, begun: Capture | None) -> int:
+def _unread_poses(path: Path) -> str:
+    """Why poses that lie beside photos or a video are not read, with the cure; empty where there are none."""
+    beside = path.name in PHOTO_FOLDERS
+    if beside and (folders := model_folders(path.parent)):
+        return f"{folders[0]}: poses of a folder that was not given (to use them, give {path.parent})"
+    folders = [folder for folder in (path, path.parent)[: 1 + beside] if folder.is_dir()]
+    for file in (file for folder in folders for file in sorted(folder.iterdir())):
+        if file.name.lower().endswith(_POSES_OF_OTHERS):
+            cure = "to keep them, export a COLMAP model or a transforms.json"
+            return f"{file}: poses of a format that is not read ({cure})"
+    return ""
+
+
+def reading(config: SceneConfig) -> dict[str, Any]:
+    """How a capture is read, as records hold it: `load_scene` takes it."""
+    images = config.images and str(config.images.resolve())
+    return {**asdict(config), "images": images}
+
+
+def _downscale(job: Job, path: Path, config: SceneConfig, begun: Capture | None) -> int:
     """The factor for a capture where none was asked for: that of the run, or what the machine can do."""
     if begun and "downscale" in begun.settings:
         return int(begun.settings["downscale"])
     if "cuda" in (job.backend, job.executor.backend) or detect(path) == "stored":
         return 1
-    cameras = [view.camera for view in load_scene(path).views]
+    as_it_is = replace(config, downscale=1, vignetting=False)
+    cameras = [view.camera for view in load_scene(path, **reading(as_it_is)).views]
     factor = cpu_downscale(float(np.median([camera.width * camera.height for camera in cameras])))
     if factor > 1:
         size = f"{cameras[0].width} x {cameras[0].height}"

@@ -139,13 +139,8 @@ def with_at_most(scene: Scene, labels: np.ndarray, count: int, seed: int) -> tup
 
 
 def capped_config(config: TrainConfig, cap: int, steps: int) -> TrainConfig:
-    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded.
-
-    Without its regularisers: in trainings of a few thousand steps they cost 0.2 to 1 dB
-    (docs/developers/far.md).
-    """
-    mcmc = replace(config, strategy="mcmc", mcmc_regularise=False, max_gaussians=cap)
-    mcmc = replace(mcmc, max_steps=steps, level_every=steps)
+    """3DGS-MCMC with at most `cap` Gaussians, otherwise as `config`; only the last level is recorded."""
+    mcmc = replace(config, strategy="mcmc", max_gaussians=cap, max_steps=steps, level_every=steps)
     return replace(mcmc, freeze_at=None, poses=False, exposure="off", outliers=False)
 
 

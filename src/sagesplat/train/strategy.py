@@ -148,7 +148,7 @@ class McmcStrategy(Densification):
 
     def step_pre_update(self, state: TrainState, grads: dict[str, Tensor], trainable: Tensor) -> None:
         """Add the gradients of the regularisation of opacities and scales."""
-        if self.config.mcmc_regularise:
+        if self.config.max_steps >= mcmc.REGULARISED_FROM:
             near = self._near(state, trainable)
             scale = mcmc.SCALE_WEIGHT / self.scene.extent
             mcmc.add_regularisation_gradients(state, grads, mcmc.OPACITY_WEIGHT, scale, near)

@@ -55,7 +55,9 @@ def _colmap(part: str, text: bool) -> Reader:
         return [(folder / "sparse" / name).read_bytes()]
 
     read = file(f"sparse/{name}", lambda path: load_colmap(path.parents[1]))
-    return Reader(f"colmap-{name.replace('.', '-')}", name[-4:], make, read)
+    # Without points there are 100,000 random ones.
+    limits = (3000, 64 * MIB) if part == "points3D" else ()
+    return Reader(f"colmap-{name.replace('.', '-')}", name[-4:], make, read, *limits)
 
 
 def points(folder: Path, size: int) -> list[bytes]:
