@@ -92,7 +92,7 @@ def read(path: Path, scratch: Path) -> str:
         parts = [f"{len(splat.gaussians):,} Gaussians ({splat.kind})"]
         parts += [f"{count:,} left out: {reason}" for reason, count in splat.dropped.items()]
         parts += [f"offset {offset_text(splat.offset)}"] if any(splat.offset) else []
-    return "; ".join([*parts, *splat.notes])
+        return "; ".join([*parts, *splat.notes])
     if path.name == "cameras.json":
         return f"{len(read_camera_file(path))} cameras"
     kind = detect(path)
