@@ -47,6 +47,7 @@ settings.register_profile(
 settings.load_profile("sagesplat")
 
 LABELS = (-1, 3, 184)
+DOT = Image.new("RGB", (1, 1))
 SMALL_RUN = RunConfig(  # of `finished_run`
     scene=SceneConfig(test_every=4, calibrate_every=3),
     train=TrainConfig(max_steps=6, level_every=2, sh_degree=1),
@@ -76,7 +77,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 # the files whose tests look at the figures of reports, or make them of what is hard to draw
 _FIGURES = (
     "test_output_report", "test_studies_paper", "test_pipeline",
-    "test_studies_sparse_categories", "test_stages_blocks", "test_stages_clean", "test_stages_clean_splat",
+    "test_studies_sparse_categories", "test_stages_clean", "test_stages_clean_splat",
 )  # fmt: skip
 
 
@@ -88,10 +89,10 @@ def draw_nothing(patch: pytest.MonkeyPatch) -> None:
     """Reports without figures, which take most of the time of a small run, and have their own tests."""
     patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path, svg=True: b"<svg/>")
     patch.setattr("sagesplat.output.report.report_figures", lambda *_: iter(()))
-    patch.setattr(
-        "sagesplat.output.before_after.before_after",
-        lambda path, *_, **options: Image.new("RGB", (1, 1)).save(path),
-    )
+    for name in ("before_after.before_after", "contact_sheet.contact_sheet"):
+        patch.setattr(
+            f"sagesplat.output.{name}", lambda path, *_, **options: Image.new("RGB", (1, 1)).save(path)
+        )
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -119,6 +120,14 @@ def unsynced() -> Iterator[None]:
     """Nobody pulls the plug on a test: thousands of small files need not reach the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("os.fsync", lambda handle: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_samples() -> Iterator[None]:
+    """Small clouds need fewer points to find room in them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sagesplat.adapt.free_space._SAMPLES", 150_000)
         yield
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sagesplat.adapt import free_poses, free_space, free_viewpoints
+from sagesplat.adapt import free_poses, free_viewpoints
 from sagesplat.adapt.free_space import sphere
 from sagesplat.adapt.free_viewpoints import FreeViewpoints, free_cameras
 from sagesplat.core.errors import RunError
@@ -17,9 +17,7 @@ from sagesplat.raster import rasterize
 
 
 @pytest.fixture(autouse=True)
-def _few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small clouds need fewer points."""
-    monkeypatch.setattr(free_space, "_SAMPLES", 150_000)
+def _few_probes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(free_viewpoints, "_PROBES", 300)
     monkeypatch.setattr(free_poses, "_PROBES", 300)
     monkeypatch.setattr(free_poses, "_BATCH", 128)

@@ -89,7 +89,7 @@ def final(events):
 @pytest.mark.parametrize(
     "config",
     [
-        replace(SHORT, max_steps=8, refine_every=50),
+        replace(SHORT, max_steps=5, refine_every=50),
         pytest.param(replace(SHORT, batch=2), marks=pytest.mark.slow),
     ],
     ids=["default", "batch"],
