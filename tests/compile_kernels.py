@@ -1,6 +1,6 @@
-"""Compiles the kernels that many tests need: `make test` runs it before processes that would do so side by side.
+"""Compiles the kernels that many tests need: processes of tests would compile the same ones side by side.
 
-It needs nothing but sagesplat itself, since tools for tests are installed beside it.
+`make test` runs it while the tools for tests are installed: it needs nothing but sagesplat.
 """
 
 import tempfile
