@@ -276,11 +276,11 @@ def test_bands_are_measured_apart() -> None:
 CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
     train=TrainConfig(max_steps=40, level_every=20, sh_degree=1),
-    blocks=BlocksConfig(count=2, boundary_steps=20),
-    nest=NestConfig(steps=30, levels=4, smallest=0.1, base_steps=30),
+    blocks=BlocksConfig(count=2, boundary_steps=8),
+    nest=NestConfig(steps=12, levels=4, smallest=0.1, base_steps=12),
     fit=FitConfig(),
     sample=SampleConfig(views=8, calibration_views=8),
-    plan=PlanConfig(target_ssim=0.4),
+    plan=PlanConfig(target_ssim=0.4, other_targets=()),
 )
 
 
@@ -426,7 +426,7 @@ def test_a_run_keeps_its_blocks(finished: Path, capture: Path) -> None:
     with pytest.raises(RunError, match=r"this run is in blocks; add --blocks\.count"):
         run_in_blocks(capture, finished, whole)
     with pytest.raises(RunError, match=r"made with other count \(2 then, 3 now\)"):
-        run_in_blocks(capture, finished, replace(CONFIG, blocks=BlocksConfig(count=3, boundary_steps=20)))
+        run_in_blocks(capture, finished, replace(CONFIG, blocks=BlocksConfig(count=3, boundary_steps=8)))
 
 
 @pytest.mark.slow
