@@ -21,17 +21,15 @@ unexport PYTHONDONTWRITEBYTECODE
 # tests would otherwise compile the same ones at the same time
 test:
 	@$(MAKE) --no-print-directory -j 2 browser $(CORE)
-	@$(MAKE) --no-print-directory -j 2 kernels types
-	@$(MAKE) --no-print-directory style suite
-	NUMBA_NUM_THREADS=2 $(BIN)/pytest -q -m threads
+	@$(MAKE) --no-print-directory -j 2 kernels types style
+	@$(MAKE) --no-print-directory suite
+	NUMBA_NUM_THREADS=2 $(BIN)/pytest -q -m threads $$(grep -l mark.threads tests/test_*.py)
 
 .PHONY: kernels
-# a run of a few steps: what it needs is compiled and kept; from the sources, as pip may be at the package
+# what most tests need is compiled and kept; from the sources, as pip may be at the package
 kernels: export PYTHONPATH = $(CURDIR)/src
 kernels: $(CORE)
-	rm -rf build/kernels
-	$(BIN)/python -c 'import sagesplat; sagesplat.make_demo_capture("build/kernels/capture", views=12, width=64, height=48)'
-	$(BIN)/python -m sagesplat run build/kernels/capture build/kernels/run --train.max-steps 20 --nest.steps 10 --nest.base-steps 10 >/dev/null
+	$(BIN)/python tests/compile_kernels.py
 
 .PHONY: suite
 # three processes of one thread each, for two cores: browsers, clusters and programs are waited for;

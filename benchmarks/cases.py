@@ -20,10 +20,10 @@ from sagesplat.core.errors import SageError
 from sagesplat.core.geometry import offset_text
 from sagesplat.formats.splats import read_splat
 from sagesplat.scene import describe, load_scene
-from sagesplat.scene._prepare import prepare_photos
 from sagesplat.scene.cameras import read_camera_file
 from sagesplat.scene.detect import VIDEOS, detect
 from sagesplat.scene.images import load_photo
+from sagesplat.scene.photos import prepare_photos
 from sagesplat.scene.video import extract_frames
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.valid import write_valid

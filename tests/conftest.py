@@ -1,7 +1,11 @@
 """Small labelled Gaussians, cameras and a capture on disk that several tests share."""
 
+import gc
+import os
+import pickle
+import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +28,7 @@ from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases, sh0_to_rgb
 from sagesplat.demo.capture import make_capture as make_demo_capture
 from sagesplat.io.files import write_json, write_text
+from sagesplat.io.lock import locked
 from sagesplat.raster import Backend, Render, rasterize, set_threads
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -42,12 +47,23 @@ settings.register_profile(
 settings.load_profile("sagesplat")
 
 LABELS = (-1, 3, 184)
+DOT = Image.new("RGB", (1, 1))
 SMALL_RUN = RunConfig(  # of `finished_run`
     scene=SceneConfig(test_every=4, calibrate_every=3),
     train=TrainConfig(max_steps=6, level_every=2, sh_degree=1),
     nest=NestConfig(steps=2, levels=4, smallest=0.1, base_share=0),
     plan=PlanConfig(target_ssim=0.4, other_targets=()),
 )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """What is imported stays: looking for garbage in it, now and at every test, finds nothing."""
+    gc.disable()
+    found = yield
+    gc.enable()
+    gc.freeze()
+    return found
 
 
 # the files that take longest: begun last, one of two processes would wait for the other
@@ -61,7 +77,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 # the files whose tests look at the figures of reports, or make them of what is hard to draw
 _FIGURES = (
     "test_output_report", "test_studies_paper", "test_pipeline",
-    "test_studies_sparse_categories", "test_stages_blocks", "test_stages_nest",
+    "test_studies_sparse_categories", "test_stages_clean", "test_stages_clean_splat",
 )  # fmt: skip
 
 
@@ -69,12 +85,22 @@ _FIGURES = (
 _PLAIN_REPORTS = ("test_run_stage", "test_run_executor", "test_stages_blocks", "test_studies_sweep")
 
 
+def draw_nothing(patch: pytest.MonkeyPatch) -> None:
+    """Reports without figures, which take most of the time of a small run, and have their own tests."""
+    patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path, svg=True: b"<svg/>")
+    patch.setattr("sagesplat.output.report.report_figures", lambda *_: iter(()))
+    for name in ("before_after.before_after", "contact_sheet.contact_sheet"):
+        patch.setattr(
+            f"sagesplat.output.{name}", lambda path, *_, **options: Image.new("RGB", (1, 1)).save(path)
+        )
+
+
 @pytest.fixture(scope="module", autouse=True)
 def no_figures(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Reports without figures, which take most of the time of a small run, and have their own tests."""
+    """Most tests draw nothing; some write no report at all."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem not in _FIGURES:
-            patch.setattr("sagesplat.output.figures.save_figure", lambda figure, path, svg=True: b"<svg/>")
+            draw_nothing(patch)
         if request.path.stem in _PLAIN_REPORTS:
             patch.setattr(
                 "sagesplat.output.report.write_report",
@@ -94,6 +120,14 @@ def unsynced() -> Iterator[None]:
     """Nobody pulls the plug on a test: thousands of small files need not reach the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("os.fsync", lambda handle: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_samples() -> Iterator[None]:
+    """Small clouds need fewer points to find room in them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sagesplat.adapt.free_space._SAMPLES", 150_000)
         yield
 
 
@@ -195,20 +229,40 @@ def write_capture(folder: Path, truth: Gaussians, *, views: int = 8, noise: floa
     return load_scene(folder)
 
 
+def shared(folders: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that `make` fills once for all processes of the tests, without figures; change only copies."""
+    base = folders.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    folder.mkdir(exist_ok=True)
+    with locked(folder, wait=3600.0):
+        if not (folder / "made").exists():
+            with pytest.MonkeyPatch.context() as patch:
+                draw_nothing(patch)
+                make(folder)
+            write_text(folder / "made", "")
+    return folder
+
+
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run on nested levels, in two seconds; its capture is beside it. Copy it before a change."""
+
+    def make(folder: Path) -> None:
+        set_threads(1)
+        truth = random_gaussians(120, degree=1, logit=2.0)
+        images = RenderedLabels(truth, "cpu")
+        scene, masks = write_capture(folder / "capture", truth, noise=0.02), folder / "capture" / "masks"
+        masks.mkdir()
+        for view in scene.views:
+            ids = np.where(images[view] < 0, 255, images[view]).astype(np.uint8)
+            Image.fromarray(ids).save(masks / view.name)
+        write_json(masks / "labels.json", {"labels": {"3": "car", "184": "tree-merged"}})
+        run_all(Job(RunDir(folder / "run"), lambda event: None, "cpu"), folder / "capture", SMALL_RUN)
+
+    made = shared(tmp_path_factory, "finished", make)
     folder = tmp_path_factory.mktemp("finished")
-    set_threads(1)
-    truth = random_gaussians(120, degree=1, logit=2.0)
-    images = RenderedLabels(truth, "cpu")
-    scene, masks = write_capture(folder / "capture", truth, noise=0.02), folder / "capture" / "masks"
-    masks.mkdir()
-    for view in scene.views:
-        ids = np.where(images[view] < 0, 255, images[view]).astype(np.uint8)
-        Image.fromarray(ids).save(masks / view.name)
-    write_json(masks / "labels.json", {"labels": {"3": "car", "184": "tree-merged"}})
-    run_all(Job(RunDir(folder / "run"), lambda event: None, "cpu"), folder / "capture", SMALL_RUN)
+    shutil.copytree(made / "run", folder / "run")  # each process may lock its own
+    (folder / "capture").symlink_to(made / "capture")
     return folder / "run"
 
 
@@ -244,23 +298,33 @@ class DemoRun:
     events: dict[str, list[Event]]  # by ladder; the nested one was made first
 
 
+DEMO_RUN = RunConfig(
+    scene=SceneConfig(calibrate_every=4),
+    train=TrainConfig(max_steps=90, level_every=30),
+    nest=NestConfig(steps=40, levels=5, smallest=0.1, base_steps=30),
+    sample=SampleConfig(views=8, calibration_views=8),
+    plan=PlanConfig(target_ssim=0.4),
+)
+
+
 @pytest.fixture(scope="session")
 def demo_run(tmp_path_factory: pytest.TempPathFactory) -> DemoRun:
     """The run that tests of the whole flow look at."""
-    folder = tmp_path_factory.mktemp("demo")
-    make_demo_capture(folder / "capture", views=16, width=80, height=60)
-    config = RunConfig(
-        scene=SceneConfig(calibrate_every=4),
-        train=TrainConfig(max_steps=90, level_every=30),
-        nest=NestConfig(steps=40, levels=5, smallest=0.1, base_steps=30),
-        sample=SampleConfig(views=8, calibration_views=8),
-        plan=PlanConfig(target_ssim=0.4),
-    )
-    made = DemoRun(folder / "capture", folder / "run", config, {"nested": [], "snapshots": []})
-    for ladder, events in made.events.items():
-        of_ladder = replace(config, ladder=ladder)
-        run_scene(made.capture, made.path, of_ladder, on_event=events.append, backend="cpu", threads=1)
-    return made
+
+    def make(folder: Path) -> None:
+        make_demo_capture(folder / "capture", views=16, width=80, height=60)
+        heard: dict[str, list[Event]] = {"nested": [], "snapshots": []}
+        for ladder, events in heard.items():
+            config = replace(DEMO_RUN, ladder=ladder)
+            run_scene(
+                folder / "capture", folder / "run", config, on_event=events.append, backend="cpu", threads=1
+            )
+        (folder / "events").write_bytes(pickle.dumps(heard))
+
+    made = shared(tmp_path_factory, "demo", make)
+    run = tmp_path_factory.mktemp("demo") / "run"
+    shutil.copytree(made / "run", run)  # each process may lock its own
+    return DemoRun(made / "capture", run, DEMO_RUN, pickle.loads((made / "events").read_bytes()))
 
 
 def wait_for(condition: Callable[[], object], seconds: float = 600.0) -> None:

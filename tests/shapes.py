@@ -1,7 +1,8 @@
 """Unless CHECK_SHAPES=0, checks jaxtyping's shapes and dtypes while tests run; import it before sagesplat.
 
 Checked are all modules that use jaxtyping, but for `EXCEPT` and those with kernels: a wrapper would change
-what is compiled. Only arrays are checked: what tests pass instead of other classes is their affair.
+what is compiled. Only arrays are checked: what tests pass instead of other classes is their affair. What
+was right once is not looked at again: shapes and dtypes decide.
 """
 
 import inspect
@@ -25,6 +26,7 @@ EXCEPT = {
 }  # fmt: skip
 
 _NO_AXES = nullcontext()
+_MISSING = object()
 
 
 def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[..., Any]:
@@ -42,28 +44,51 @@ def check(function: Callable[..., Any], *, axes: Any = _NO_AXES) -> Callable[...
     if not hints and of_result is None:
         return function
 
+    fine: set[Any] = set()  # forms of arguments and results that were right
+
+    def refuse(what: object) -> None:
+        raise jaxtyping.TypeCheckError(f"{function.__qualname__}: {what}")  # type: ignore
+
     @wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         if jaxtyping.config.jaxtyping_disable:
             return function(*args, **kwargs)
-        with axes:
-            for place, name, hint, fits in hints:
-                if place < len(args):
-                    value = args[place]
-                elif name in kwargs:
-                    value = kwargs[name]
-                else:
-                    continue
+        given = [
+            (value, name, hint, fits)
+            for place, name, hint, fits in hints
+            if (value := args[place] if place < len(args) else kwargs.get(name, _MISSING)) is not _MISSING
+        ]
+
+        def check_given() -> None:
+            for value, name, hint, fits in given:
                 if not fits(value):
-                    raise jaxtyping.TypeCheckError(f"{function.__qualname__}: {name} is not {hint}")  # type: ignore
-            found = function(*args, **kwargs)
-            if of_result and not of_result(found):
-                raise jaxtyping.TypeCheckError(
-                    f"{function.__qualname__}: the result is not {signature.return_annotation}"  # type: ignore
-                )
-            return found
+                    refuse(f"{name} is not {hint}")
+
+        form = tuple((name, _form(value)) for value, name, _, _ in given)
+        if form not in fine:
+            with axes:
+                check_given()
+            fine.add(form)
+        found = function(*args, **kwargs)
+        if of_result and (form, _form(found)) not in fine:
+            with axes:
+                check_given()  # whose axes are those of the result
+                if not of_result(found):
+                    refuse(f"the result is not {signature.return_annotation}")
+            fine.add((form, _form(found)))
+        return found
 
     return wrapper
+
+
+def _form(value: Any) -> Any:
+    """All of a value that a check depends on."""
+    if isinstance(value, tuple | list):
+        return tuple(map(_form, value))
+    if isinstance(value, dict):
+        return tuple(map(_form, value.values()))
+    shape = getattr(value, "shape", None)
+    return type(value) if shape is None else (type(value), getattr(value, "dtype", None), tuple(shape))
 
 
 def decorator(*, typechecker: Callable[..., Any]) -> Callable[..., Any]:

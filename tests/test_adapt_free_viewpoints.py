@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sagesplat.adapt import free_space
+from sagesplat.adapt import free_poses, free_viewpoints
 from sagesplat.adapt.free_space import sphere
 from sagesplat.adapt.free_viewpoints import FreeViewpoints, free_cameras
 from sagesplat.core.errors import RunError
@@ -17,15 +17,16 @@ from sagesplat.raster import rasterize
 
 
 @pytest.fixture(autouse=True)
-def _few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small clouds need fewer points, and hypothesis draws many clouds."""
-    monkeypatch.setattr(free_space, "_SAMPLES", 150_000)
+def _few_probes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(free_viewpoints, "_PROBES", 300)
+    monkeypatch.setattr(free_poses, "_PROBES", 300)
+    monkeypatch.setattr(free_poses, "_BATCH", 128)
 
 
 def discs(means: np.ndarray, normals: np.ndarray, radius: float, logit: float = 4.0) -> Gaussians:
     """Flat round Gaussians, thin along their normals."""
-    turns = [Rotation.align_vectors(normal[None], [[0, 0, 1]])[0] for normal in normals]
-    quats = np.stack([turn.as_quat(scalar_first=True) for turn in turns])
+    quats = np.column_stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]])
+    quats[normals[:, 2] < -0.999] = [0, 1, 0, 0]  # half a turn
     count = len(means)
     scales = np.log(np.tile([radius, radius, radius / 20], (count, 1)))
     return Gaussians(

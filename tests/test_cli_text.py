@@ -14,7 +14,7 @@ from sagesplat.formats.ply import write_ply
 
 PROMPTS = "stone fountain; ivy; wooden bench"
 SMALL = (
-    "--train.max-steps", "40", "--nest.steps", "12", "--nest.levels", "3", "--nest.base-steps", "6",
+    "--train.max-steps", "20", "--nest.steps", "6", "--nest.levels", "3", "--nest.base-steps", "3",
     "--sample.views", "6", "--sample.calibration-views", "6", "--target-fidelity", "0.6", "--threads", "1",
 )  # fmt: skip
 

@@ -55,22 +55,30 @@ def run_by_readers(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     return in_package(called)
 
 
-def test_every_function_that_reads_is_fuzzed_or_an_exception(run_by_readers: set[str]):
+@pytest.fixture(scope="module")
+def reading() -> list[tuple[str, str, int]]:
+    """All of the package's source is parsed for it."""
+    return list(readers_in())
+
+
+def test_every_function_that_reads_is_fuzzed_or_an_exception(
+    run_by_readers: set[str], reading: list[tuple[str, str, int]]
+):
     missing = [
         f"{name} reads (line {line}: {call}), and no reader of tests/fuzz/readers runs it: add one "
         "there that does, or its name and a reason to EXCEPTIONS in tests/fuzz/foreign.py"
-        for name, call, line in readers_in()
+        for name, call, line in reading
         if name not in run_by_readers and name not in EXCEPTIONS
     ]
     assert not missing, "\n".join(missing)
 
 
-def test_exceptions_are_needed(run_by_readers: set[str]):
+def test_exceptions_are_needed(run_by_readers: set[str], reading: list[tuple[str, str, int]]):
     """An exception for a function that is gone, reads no more, or is run by a reader, is to be removed.
 
     What is the package's own may be run besides, or not, as some of it is read once in a process.
     """
-    reading = {name for name, _, _ in readers_in()}
+    names = {name for name, _, _ in reading}
     foreign = {name for name, reason in EXCEPTIONS.items() if reason not in (OURS, MACHINE)}
-    assert sorted(EXCEPTIONS.keys() - reading) == []
+    assert sorted(EXCEPTIONS.keys() - names) == []
     assert sorted(foreign & run_by_readers) == []

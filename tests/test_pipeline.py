@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import DemoRun
+from conftest import DemoRun, draw_nothing
 
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.observe import TOTAL, read_observations
@@ -99,8 +99,9 @@ def test_a_second_run_has_nothing_to_do(demo_run: DemoRun, config: RunConfig) ->
 
 
 def test_other_settings_need_force_and_redo_only_what_depends_on_them(
-    finished: Path, capture: Path, config: RunConfig, tmp_path: Path
+    finished: Path, capture: Path, config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    draw_nothing(monkeypatch)
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     other = replace(config, plan=PlanConfig(target_ssim=0.5))
     with pytest.raises(RunError, match=r"plan\.json: made with other .*--force"):

@@ -26,6 +26,7 @@ def run(name: str, folder: Path, config: RunConfig) -> tuple[float, float]:
     return float(whole.full_ssim.mean()), float(whole.full_psnr.mean())
 
 
+@pytest.mark.slow
 def test_one_camera_per_image_with_principal_points_off_centre(tmp_path: Path) -> None:
     config = RunConfig(
         scene=SceneConfig(downscale=8),

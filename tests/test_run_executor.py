@@ -46,7 +46,7 @@ CONFIG = RunConfig(
     train=TrainConfig(max_steps=40, level_every=20, sh_degree=1),
     nest=NestConfig(steps=6, levels=3, base_steps=10),
     sample=SampleConfig(views=8, calibration_views=8),
-    plan=PlanConfig(target_ssim=0.4),
+    plan=PlanConfig(target_ssim=0.4, other_targets=()),
 )
 COMPARE = CompareConfig(
     snapshots=2, shares=(0.3, 0.5), tune_steps=2, caps=(0.5,), budgets=2, lpips=Path("no")

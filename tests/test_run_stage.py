@@ -45,7 +45,7 @@ CONFIG = RunConfig(
     train=TrainConfig(max_steps=20, level_every=10, sh_degree=1),
     nest=NestConfig(steps=12, levels=3, smallest=0.1, base_steps=10),
     sample=SampleConfig(views=8, calibration_views=8),
-    plan=PlanConfig(target_ssim=0.4),
+    plan=PlanConfig(target_ssim=0.4, other_targets=()),
 )
 BLOCKS = BlocksConfig(count=2)
 
@@ -200,7 +200,7 @@ class Watch:
     [
         {
             "fuse": True,
-            "plan": PlanConfig(target_ssim=0.4, budget=1e4),
+            "plan": PlanConfig(target_ssim=0.4, other_targets=(), budget=1e4),
             "train": replace(CONFIG.train, poses=True),
         },
         pytest.param(

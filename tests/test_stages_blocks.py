@@ -277,10 +277,10 @@ CONFIG = RunConfig(
     scene=SceneConfig(calibrate_every=4),
     train=TrainConfig(max_steps=40, level_every=20, sh_degree=1),
     blocks=BlocksConfig(count=2),
-    nest=NestConfig(steps=30, levels=4, smallest=0.1, base_steps=30),
+    nest=NestConfig(steps=12, levels=4, smallest=0.1, base_steps=12),
     fit=FitConfig(),
     sample=SampleConfig(views=8, calibration_views=8),
-    plan=PlanConfig(target_ssim=0.4),
+    plan=PlanConfig(target_ssim=0.4, other_targets=()),
 )
 
 

@@ -35,6 +35,7 @@ from sagesplat.stages.plan import make_plan
 from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
 from sagesplat.stages.train import train_levels
+from sagesplat.studies.compare import report
 from sagesplat.studies.compare.report import (
     MCMC,
     PLANNED,
@@ -165,7 +166,7 @@ def test_a_comparison_reads_back_and_damage_is_one_line(tmp_path):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Job:
     folder = tmp_path_factory.mktemp("compare")
-    make_capture(folder / "capture", views=12, width=80, height=60)
+    make_capture(folder / "capture", views=12, width=64, height=48)
     job = Job(RunDir(folder / "run"), lambda event: None)
     open_scene(job, folder / "capture", SceneConfig())
     make_masks(job, MasksConfig())
@@ -236,8 +237,9 @@ def test_mcmc_keeps_its_cap_even_below_the_number_of_points(compared):
         assert 0.8 * share * full < len(g) <= round(share * full)
 
 
-def test_a_second_comparison_trains_nothing_and_a_killed_one_goes_on(compared):
+def test_a_second_comparison_trains_nothing_and_a_killed_one_goes_on(compared, monkeypatch):
     job, _, _ = compared
+    monkeypatch.setattr(report, "save_figure", lambda *_: b"")
     events: list[Event] = []
     again = replace(job, emit=events.append)
     compare(again, CONFIG)

@@ -25,7 +25,7 @@ from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import bundle
-from sagesplat.studies.measure import score
+from sagesplat.studies.measure import report, run, score
 from sagesplat.studies.measure.levels import levels_of
 from sagesplat.studies.measure.report import levels_table
 from sagesplat.studies.measure.run import measure
@@ -35,6 +35,14 @@ from tests.fuzz.readers.foreign_splats import put_sog, sog, streamed
 FULL = random_gaussians(150, degree=1, logit=2.0)
 NAMES = {3: "car", 184: "tree"}
 VIEWS = 3
+
+
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Drawing takes most of the time."""
+    if request.function is not test_files_against_a_file:
+        monkeypatch.setattr(report, "save_figure", lambda *_: b"")
+        monkeypatch.setattr(run, "contact_sheet", lambda *_, **options: None)
 
 
 @pytest.fixture
@@ -64,6 +72,8 @@ def test_files_against_a_file(files):
     events: list[Event] = []
     paths = [files / name for name in ("full.ply", "same.ply", "third.ply")]
     found = measure(paths, files / "out", settings(files), events.append)
+    for name in ("measure.png", "measure.svg", "viewpoints.png"):
+        assert (files / "out" / name).stat().st_size > 1000
     assert found.names == ["same.ply", "third.ply"]
     assert found.counts == [150, 50]
     assert found.nbytes == [path.stat().st_size for path in paths[1:]]

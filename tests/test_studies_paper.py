@@ -55,7 +55,7 @@ PAPER = PaperConfig(tune_steps=5)
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=12, width=80, height=60)
+    make_capture(folder, views=12, width=64, height=48)
     return folder
 
 

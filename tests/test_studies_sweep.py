@@ -30,7 +30,7 @@ TEXT = """
 targets = [0.4, 0.3]
 seeds = [0, 5]
 settings.ladder = "snapshots"
-settings.train = { max_steps = 60, level_every = 20, refine_every = 5, sh_degree = 1 }
+settings.train = { max_steps = 30, level_every = 10, refine_every = 5, sh_degree = 1 }
 scenes.plot = "capture"
 variants.track = {}
 variants.flat.train.sh_degree = 0
@@ -64,7 +64,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the capture, the file and the finished sweep."""
     folder = tmp_path_factory.mktemp("sweep")
-    make_capture(folder / "capture", views=12, width=80, height=60)
+    make_capture(folder / "capture", views=12, width=64, height=48)
     events = sweep_in(folder)
     assert [name for name in done(events) if "/" not in name] == CELLS
     assert done(events).count("plot-track-seed5/train") == 1

@@ -89,7 +89,7 @@ def final(events):
 @pytest.mark.parametrize(
     "config",
     [
-        replace(SHORT, max_steps=8, refine_every=50),
+        replace(SHORT, max_steps=5, refine_every=50),
         pytest.param(replace(SHORT, batch=2), marks=pytest.mark.slow),
     ],
     ids=["default", "batch"],
@@ -162,7 +162,7 @@ def test_mcmc_and_what_was_killed(scene, on_gpu, tmp_path):  # noqa: F811
 
 
 def test_quality_is_what_the_cpu_measures(scene, on_gpu, monkeypatch):  # noqa: F811
-    g = final(run(scene, SHORT))
+    g = final(run(scene, replace(SHORT, max_steps=8)))
     work, rows = ActiveTiles(scene, Halves()), measured_views(scene, Halves())  # type: ignore[arg-type]
     feed = stepper.PhotoLoader(scene, Photos(scene.views), CPU)
     there = label_quality(g, work, feed, rows, SHORT, 3, backend="cuda")

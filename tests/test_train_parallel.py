@@ -77,6 +77,7 @@ def test_a_killed_pair_goes_on(capture, tmp_path):  # noqa: F811
         assert float((a - b).abs().mean()) < 1e-3 * float(a.std()), name
 
 
+@pytest.mark.slow
 def test_a_process_that_cannot_go_on_says_why(capture, capfd):  # noqa: F811
     scene, _, masks, labels = capture
     config = TrainConfig(max_steps=20)

@@ -291,6 +291,7 @@ def test_labels_are_edited_on_this_machine_only(finished_run: Path) -> None:
         show(finished_run, lambda event: None, follow=True, edit=True)
 
 
+@pytest.mark.slow
 @browser_test
 def test_the_viewer_saves_in_the_run_folder(finished_run: Path, tmp_path: Path, browser: Any) -> None:
     import shutil

@@ -88,7 +88,7 @@ def build_places(seed: int, places: tuple[int, int]) -> World:
         paths=np.array(paths),
         solid_place=np.array(solid_place),
         body_place=np.array(body_place + [0] * len(hedges)),
-        places=np.stack([np.column_stack([p.turn.T, -p.turn.T @ p.centre]) for p in layout]),
+        places=np.array([np.column_stack([p.turn.T, -p.turn.T @ p.centre]) for p in layout]),
         tints=tints,
         solid_object=np.full(len(solids), NO_OBJECT, np.int16),
         body_object=np.full(len(bodies) + len(hedges), NO_OBJECT, np.int16),
