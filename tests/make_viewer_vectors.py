@@ -104,7 +104,8 @@ def model(
     position, direction = rng.normal(0, 0.7, (views, 3)), rng.normal(size=(views, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     screens = SCREENS if quality == "fidelity" else PHOTOS_ONLY
-    log_screen = rng.uniform(*np.log(screens), views)
+    low, high = np.log(screens)
+    log_screen = rng.uniform(low, high, views)
     return ViewModel(
         label_id=7,
         quality=quality,

@@ -21,8 +21,8 @@ from tests.test_formats_spz import rotations
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
-def put(path: Path, document: dict[str, Any], content: bytes) -> Path:
-    path.write_bytes(glb(document, content))
+def put(path: Path, document: dict[str, Any], content: bytes | bytearray) -> Path:
+    path.write_bytes(glb(document, bytes(content)))
     return path
 
 
@@ -161,7 +161,7 @@ def test_only_the_first_buffer_is_the_binary_chunk(tmp_path):
     assert len(read_splat(put(tmp_path / "a.glb", document, content)).gaussians) == 9
 
 
-def values(document: dict[str, Any], content: bytes, name: str) -> np.ndarray:
+def values(document: dict[str, Any], content: bytearray, name: str) -> np.ndarray:
     """A writable view of a float attribute of a `bytearray`."""
     at = document["meshes"][0]["primitives"][0]["attributes"][name]
     view = document["bufferViews"][document["accessors"][at]["bufferView"]]

@@ -207,6 +207,8 @@ def test_binary_and_text_models_are_the_same(tmp_path):
     models = [read_model(tmp_path / kind / "sparse" / "0") for kind in ("bin", "txt")]
     (cameras, images, points), (cameras2, images2, points2) = models
     assert cameras[7].params == cameras2[7].params
+    assert points
+    assert points2
     assert all(np.array_equal(a, b) for a, b in zip(points, points2, strict=True))
     for a, b in zip(images, images2, strict=True):
         assert (a.id, a.name, a.camera_id) == (b.id, b.name, b.camera_id)

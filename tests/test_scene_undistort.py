@@ -274,6 +274,7 @@ def test_faces_of_a_cube_show_the_scene(lens, tmp_path):
         rays = np.stack([u, v, 0 * u + 1], -1)
         rays[..., :2] = (rays[..., :2] - camera.K[:2, 2]) / camera.K[0, 0]
         world = rays @ camera.w2c[:3, :3]
+        assert view.lens is not None
         shown = seen(view.lens, camera.K, camera.width, camera.height)
         difference = np.abs(load_photo(view) - colour_around(world @ turn.T))[shown]
         assert np.quantile(difference, 0.99) < 2.5

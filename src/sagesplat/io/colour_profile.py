@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -56,8 +56,9 @@ def profile_of(content: bytes) -> Profile:
         return Profile("damaged", f"{len(content):,} bytes")
     try:
         opened = ImageCms.ImageCmsProfile(BytesIO(content))
-        name = short(repaired((opened.profile.profile_description or "").strip(), "without a name"))
-        mode = _SPACES.get(opened.profile.xcolor_space.strip(), "")
+        header: Any = opened.profile  # whose type Pillow declares too narrowly
+        name = short(repaired((header.profile_description or "").strip(), "without a name"))
+        mode = _SPACES.get(header.xcolor_space.strip(), "")
         if not mode:
             return Profile("damaged", name)
         steps = np.linspace(0, 255, 9).round().astype(np.uint8)

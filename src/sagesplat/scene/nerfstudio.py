@@ -244,11 +244,11 @@ def frame_cameras(file: Path) -> tuple[list[tuple[str, Camera]], bool, Position]
 
 def _read(file: Path, content: dict[str, Any] | None = None) -> tuple[_Transforms, list[_Frame]]:
     """The content of a transforms file, and its frames with the file's shared values filled in."""
-    content = read_json(file, _CURE, SceneError) if content is None else content
+    read = read_json(file, _CURE, SceneError) if content is None else content
     cure = 'export the transforms again, with {"frames": [...]} in them'
     with refused(file, "a transforms file", cure, SceneError):
-        transforms = convert_as(content, _Transforms)
-    shared = {field.name: content[field.name] for field in fields(_Frame) if field.name in content}
+        transforms = convert_as(read, _Transforms)
+    shared = {field.name: read[field.name] for field in fields(_Frame) if field.name in read}
     frames = []
     for number, entry in enumerate(transforms.frames):
         try:
