@@ -291,7 +291,7 @@ def _views(
     root = images or file.parent
     photos = PhotoFolder(root).find(written)
     check_found(photos, file.name)
-    if images is None and all(name.startswith("images/") for name in photos.files.values()):
+    if all(name.startswith("images/") for name in photos.files.values()):
         root = root / "images"
         files = {name: found.removeprefix("images/") for name, found in photos.files.items()}
         photos = Found(root, written, files, prefix="images/")
