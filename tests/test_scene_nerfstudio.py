@@ -461,6 +461,20 @@ def test_panoramas_and_lenses_by_other_names(tmp_path):
                 del frame[key]
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_transforms_of_windows_tools(tmp_path, encoding):
+    content = capture(tmp_path)
+    (tmp_path / "transforms.json").write_text(json.dumps(content), encoding=encoding)
+    assert len(load_transforms(tmp_path).views) == 5
+
+
+def test_masks_among_photos_are_not_counted_as_photos(tmp_path):
+    capture(tmp_path)
+    for photo in list((tmp_path / "images").iterdir()):
+        Image.new("L", (40, 30), 255).save(photo.with_name(f"{photo.stem}_mask.png"))
+    assert "5 of 5 photos have poses" in load_transforms(tmp_path).notes
+
+
 def test_points_at_the_end_of_a_path_of_another_machine(tmp_path):
     content = capture(tmp_path)
     head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float X\nproperty float Y\nproperty float Z\n"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sagesplat.core.errors import SceneError, short
-from sagesplat.scene.colmap_read import read_names
+from sagesplat.scene.colmap_read import model_file, read_names
 from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTO_FOLDERS, PHOTOS, Found, PhotoFolder, folders_of
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
@@ -85,7 +85,7 @@ def _describe(path: Path, best: FoundModel, others: dict[Path, str]) -> list[str
 
 
 def _holds_model(folder: Path) -> bool:
-    return any(os.path.isfile(folder / name) for name in (*MODEL_FILES, "images.bin"))  # if in part
+    return any(model_file(folder, name) for name in (*MODEL_FILES, "images.bin"))  # if in part
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:

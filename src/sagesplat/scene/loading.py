@@ -1,5 +1,6 @@
 """Shared by the loaders of captures: checks of settings, views of photos, and what is said about them."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -10,6 +11,7 @@ from jaxtyping import Float
 
 from sagesplat.core.errors import SceneError, short
 from sagesplat.scene.find_photos import PHOTO_FOLDERS, Found, PhotoFolder
+from sagesplat.scene.given_masks import is_mask_among
 from sagesplat.scene.images import photo_size
 from sagesplat.scene.scene import Camera, Lens, View
 from sagesplat.scene.undistort import (
@@ -69,8 +71,13 @@ def at_downscale(photos: Found, downscale: int) -> tuple[dict[str, Path], int]:
 
 def describe_photos(photos: Found) -> list[str]:
     """Lines on the photos that poses are for: how many of how many have one, which are gone or renamed."""
-    total = len(PhotoFolder(photos.folder).files)
-    lines = [f"{len(photos.files)} of {max(total, len(photos.files))} photos have poses"]
+    posed = set(photos.files.values())
+    rest = [Path(file.written) for file in PhotoFolder(photos.folder).files if file.written not in posed]
+    beside: dict[Path, set[str]] = defaultdict(set)
+    for file in (*map(Path, posed), *rest):
+        beside[file.parent].add(file.name.lower())
+    rest = [file for file in rest if not is_mask_among(photos.folder / file, frozenset(beside[file.parent]))]
+    lines = [f"{len(posed)} of {len(posed) + len(rest)} photos have poses"]
     if missing := photos.missing:
         first = short(repr(missing[0]))
         lines.append(

@@ -34,7 +34,7 @@ from sagesplat.scene.loading import (
     describe_photos,
     views_of,
 )
-from sagesplat.scene.points import random_points, read_points
+from sagesplat.scene.points import random_points, read_points, seen_or_random
 from sagesplat.scene.scene import Camera, Lens, Scene, View
 from sagesplat.scene.undistort import SPHERE, pinhole
 
@@ -149,6 +149,9 @@ def load_transforms(
     if points is None:
         points = random_points(ordered)
         notes.append(f"no points: training begins with {len(points.xyz):,} random ones that cameras see")
+    else:
+        points, more = seen_or_random(points, ordered, short(transforms.ply_file_path or ""))
+        notes += more
     folder = file.parent
     return Scene(
         repaired(folder.resolve().name), folder, ordered, points, test_every, test_names=test_names,

@@ -5,9 +5,9 @@ with OpenGL axes, in the file's own world. Photos are found by `find_photos`. De
 
 Polycam, raw data: keyframes/images/N.jpg with keyframes/cameras/N.json, or corrected_images and
 corrected_cameras, which Polycam made by bundle adjustment. Record3D: rgbd/N.jpg or rgb/N.jpg, and
-metadata.json (metadata in an unpacked .r3d) with `K` (by columns), `poses` (quaternion x y z w, then the position) and
-`perFrameIntrinsicCoeffs`. Metashape: "Export Cameras" as Agisoft XML; camera models are those of its manual,
-appendix D.
+metadata.json (metadata in an unpacked .r3d) with `K` (by columns), `poses` (quaternion x y z w, then the
+position) and `perFrameIntrinsicCoeffs`. Metashape: "Export Cameras" as Agisoft XML; camera models are those
+of its manual, appendix D.
 """
 
 from collections.abc import Iterator
