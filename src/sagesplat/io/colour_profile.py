@@ -34,8 +34,7 @@ def in_srgb(image: Image.Image) -> Image.Image:
     Modes with a profile become RGB or RGBA. 16 bits are left alone.
     """
     content = image.info.get("icc_profile")
-    profile = profile_of(content) if content else None
-    if profile is None or not _converts(profile, image):
+    if not content or not _converts(profile := profile_of(content), image):
         return image
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
     plain = image if image.mode == profile.mode else image.convert(profile.mode)

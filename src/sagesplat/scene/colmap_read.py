@@ -141,7 +141,7 @@ def _text_cameras(path: Path, lines: list[str]) -> dict[int, ModelCamera]:
     for line in _records(lines):
         id, model, *values = line.split()
         width, height, *params = map(float, values)  # tools other than COLMAP write sizes as 96.0, too
-        if not (width.is_integer() and height.is_integer()):
+        if width % 1 or height % 1:
             raise ValueError(f"camera {id}: size {width} x {height} is not of whole pixels")
         name = model.upper() if model.upper() in CAMERA_MODELS else _unknown_model(path, model)
         cameras[int(id)] = camera_of_model(int(id), name, int(width), int(height), params)
