@@ -263,6 +263,13 @@ def test_files_of_a_model_in_other_letters_and_sizes_with_decimals(tmp_path):
         load_scene(tmp_path)
 
 
+def test_photos_that_structure_from_motion_left_out_are_counted(tmp_path):
+    """They are not among those of the capture that it made."""
+    capture(tmp_path, [PINHOLE])
+    (tmp_path / "poses.json").write_text('{"num_photos": 9}')
+    assert "5 of 9 photos have poses" in load_scene(tmp_path).notes
+
+
 def test_points_that_no_photo_shows_are_not_trained_on(tmp_path, monkeypatch):
     """Those of a PLY file in UTM beside poses in local coordinates."""
     monkeypatch.setattr(points, "random_points", partial(random_points, count=300))

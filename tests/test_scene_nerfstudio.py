@@ -231,6 +231,7 @@ def test_listed_split(tmp_path):
     assert load_transforms(tmp_path, test_every=0).train_ids.tolist() == list(range(8))
     for listed, tests in (
         ({"val_filenames": paths[:2]}, [6, 7]),
+        ({"val_filenames": paths[:2], "test_filenames": []}, [6, 7]),
         ({"train_filenames": [p.removeprefix("./") for p in paths[:4]]}, [0, 1, 2, 3]),
     ):
         plain = {key: value for key, value in content.items() if not key.endswith("_filenames")}

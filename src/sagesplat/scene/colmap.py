@@ -24,6 +24,7 @@ from sagesplat.scene.loading import (
     views_of,
 )
 from sagesplat.scene.points import random_points, read_points, seen_or_random
+from sagesplat.scene.raw_photos import photos_before
 from sagesplat.scene.scene import Lens, Points, Scene, View
 from sagesplat.scene.undistort import FACES, SPHERE, distort, intrinsics
 
@@ -52,7 +53,7 @@ def load_colmap(
         cameras, listed, points = read_model(chosen.folder)
         _check_names(chosen.folder, listed)
         listed = _there(chosen, listed)
-        notes += describe_photos(chosen.photos)
+        notes += describe_photos(chosen.photos, photos_before(path))
         files, divisor = at_downscale(chosen.photos, downscale)
         listed = sorted(listed, key=lambda image: chosen.photos.files[image.name])
         offset, listed, points = _near_origin(listed, points)

@@ -69,15 +69,18 @@ def at_downscale(photos: Found, downscale: int) -> tuple[dict[str, Path], int]:
     return {name: small / found.files[file] for name, file in photos.files.items()}, 1
 
 
-def describe_photos(photos: Found) -> list[str]:
-    """Lines on the photos that poses are for: how many of how many have one, which are gone or renamed."""
+def describe_photos(photos: Found, least: int = 0) -> list[str]:
+    """Lines on the photos that poses are for: how many of how many have one, which are gone or renamed.
+
+    `least`: photos that there were, of which those without poses may have been left out.
+    """
     posed = set(photos.files.values())
     rest = [Path(file.written) for file in PhotoFolder(photos.folder).files if file.written not in posed]
     beside: dict[Path, set[str]] = defaultdict(set)
     for file in (*map(Path, posed), *rest):
         beside[file.parent].add(file.name.lower())
     rest = [file for file in rest if not is_mask_among(photos.folder / file, frozenset(beside[file.parent]))]
-    lines = [f"{len(posed)} of {len(posed) + len(rest)} photos have poses"]
+    lines = [f"{len(posed)} of {max(least, len(posed) + len(rest))} photos have poses"]
     if missing := photos.missing:
         first = short(repr(missing[0]))
         lines.append(

@@ -420,9 +420,7 @@ def _listed_split(
 ) -> tuple[list[View], frozenset[str] | None]:
     """The views that the file's lists name, and the names of the test views (None without lists)."""
     lists = {
-        kind: names
-        for kind in ("train", "test", "val")
-        if (names := getattr(content, f"{kind}_filenames")) is not None
+        kind: names for kind in ("train", "test", "val") if (names := getattr(content, f"{kind}_filenames"))
     }
     views = [view for _, of_frame in by_frame for view in of_frame]
     if not lists:
@@ -433,11 +431,10 @@ def _listed_split(
     for kind, given in lists.items():
         listed = [plain(_written(file, f"{kind}_filenames", name)) for name in given]
         unknown = [name for name in listed if name not in every]
-        if not listed or unknown:
-            first = f", first {short(repr(unknown[0]))}" if unknown else ""
+        if unknown:
             raise SceneError(
-                f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame{first}; "
-                "list the file_path of frames, or leave the list out"
+                f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame, first "
+                f"{short(repr(unknown[0]))}; list the file_path of frames, or leave the list out"
             )
         names[kind] = set().union(
             *(of_frames.get(name, ()) for name in listed)
