@@ -99,7 +99,7 @@ def test_srgb_stays_as_it_is(tmp_path):
     assert profile_of(made).kind == "srgb"
 
 
-def test_grey_and_transparent_pictures():
+def test_grey_and_transparent_pictures(tmp_path):
     content = profile(P3, 1.0, "linear", grey=True)
     grey = Image.fromarray(np.full((4, 4), 55, np.uint8))
     grey.info["icc_profile"] = content
@@ -107,6 +107,10 @@ def test_grey_and_transparent_pictures():
     coloured = Image.fromarray(_picture())
     coloured.info["icc_profile"] = content  # not of this picture
     assert in_srgb(coloured) is coloured
+    coloured.save(tmp_path / "a.png", icc_profile=content)
+    assert describe_profiles([tmp_path / "a.png"]) == [
+        "photos that the profile linear is not for, read without it: 1"
+    ]
     pixels = np.dstack([_picture(), np.full((12, 16), 255, np.uint8)])
     pixels[:6, :, 3] = 0
     clear = Image.fromarray(pixels)

@@ -54,6 +54,8 @@ def test_cameras_of_3dgs(tmp_path):
     assert found[0].camera.K.tolist() == [[40, 0, 24], [0, 41, 16], [0, 0, 1]]
     assert found[0].photo is None
     assert_as_drawn(read_camera_file(tmp_path))  # the folder of a model
+    put(tmp_path, [entry(i) | {"cx": 20.5, "cy": 17.0} for i in range(4)])
+    assert read_camera_file(path)[0].camera.K.tolist() == [[40, 0, 20.5], [0, 41, 17], [0, 0, 1]]
 
 
 def test_viewpoints_of_a_run(tmp_path):

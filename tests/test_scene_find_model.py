@@ -10,7 +10,7 @@ from PIL import Image
 from test_scene_colmap import PINHOLE, capture, poses, project
 
 from sagesplat.core.errors import SceneError
-from sagesplat.scene import colmap, describe, load_scene
+from sagesplat.scene import colmap, describe, load_scene, points
 from sagesplat.scene.detect import detect
 from sagesplat.scene.points import random_points
 
@@ -184,13 +184,16 @@ def test_models_written_by_hand(tmp_path):
         "mixed": "\n".join(f"{a}\n# seen\n\n{b}" for a, b in zip(records, observations, strict=True)),
         "no end": "\r\n".join(records[:-1]) + "\r\n\r\n" + records[-1],
         "utf-8 mark": "\ufeff" + "\n".join(lines[2:]),
+        "old Macintosh": "\r".join(lines[2:]),
     }
     for kind, text in written.items():
-        (model / "images.txt").write_text(text, encoding="utf-8")
+        (model / "images.txt").write_bytes(text.encode())
         scene = load_scene(tmp_path)
         assert len(scene.views) == 5, kind
         np.testing.assert_allclose(scene.views[2].camera.w2c, poses(5)[0], atol=1e-6)
-        assert bool(len(scene.points.track_points)) == (kind in ("mixed", "utf-8 mark")), kind
+        assert bool(len(scene.points.track_points)) == (kind in ("mixed", "utf-8 mark", "old Macintosh")), (
+            kind
+        )
     for name in ("cameras", "images"):
         path = model / f"{name}.txt"
         path.write_bytes(path.read_text(encoding="utf-8-sig").encode("utf-16"))
@@ -243,6 +246,43 @@ def test_a_model_without_cameras_is_not_passed_over(tmp_path):
     (folder / "colmap/sparse/0/cameras.bin").unlink()
     with pytest.raises(SceneError, match=r"cameras\.txt: no such file; copy the whole model"):
         load_scene(folder)
+
+
+def test_files_of_a_model_in_other_letters_and_sizes_with_decimals(tmp_path):
+    capture(tmp_path, [PINHOLE], text=True)
+    model = tmp_path / "sparse/0"
+    cameras = (model / "cameras.txt").read_text()
+    (model / "cameras.txt").write_text(cameras.replace(" 40 30 ", " 40.0 3.0e+1 "))
+    for file in list(model.iterdir()):
+        file.rename(file.with_name(file.name.lower().capitalize()))
+    scene = load_scene(tmp_path)
+    assert len(scene.points.track_points) == 5 * 16
+    assert (scene.views[0].camera.width, scene.views[0].camera.height) == (40, 30)
+    (model / "Cameras.txt").write_text(cameras.replace(" 40 30 ", " 40.5 30 "))
+    with pytest.raises(SceneError, match=r"size 40\.5 x 30\.0 is not of whole pixels"):
+        load_scene(tmp_path)
+
+
+def test_photos_that_structure_from_motion_left_out_are_counted(tmp_path):
+    """They are not among those of the capture that it made."""
+    capture(tmp_path, [PINHOLE])
+    (tmp_path / "poses.json").write_text('{"num_photos": 9}')
+    assert "5 of 9 photos have poses" in load_scene(tmp_path).notes
+
+
+def test_points_that_no_photo_shows_are_not_trained_on(tmp_path, monkeypatch):
+    """Those of a PLY file in UTM beside poses in local coordinates."""
+    monkeypatch.setattr(points, "random_points", partial(random_points, count=300))
+    capture(tmp_path, [PINHOLE])
+    (tmp_path / "sparse/0/points3D.bin").unlink()
+    head = HEAD.replace("2", "1") + XYZ.replace("float", "double")
+    (tmp_path / "sparse/0/points3D.ply").write_text(f"{head}end_header\n512345.7 5401234.5 321.2\n")
+    scene = load_scene(tmp_path)
+    assert len(scene.points.xyz) == 300
+    assert scene.notes[-1].startswith(
+        "no photo shows any of the 1 points of points3D.ply: their origin or axes"
+    )
+    assert sum("random" in note for note in scene.notes) == 1
 
 
 def test_points_without_errors_and_models_in_small_letters(tmp_path):

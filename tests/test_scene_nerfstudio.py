@@ -231,6 +231,7 @@ def test_listed_split(tmp_path):
     assert load_transforms(tmp_path, test_every=0).train_ids.tolist() == list(range(8))
     for listed, tests in (
         ({"val_filenames": paths[:2]}, [6, 7]),
+        ({"val_filenames": paths[:2], "test_filenames": []}, [6, 7]),
         ({"train_filenames": [p.removeprefix("./") for p in paths[:4]]}, [0, 1, 2, 3]),
     ):
         plain = {key: value for key, value in content.items() if not key.endswith("_filenames")}
@@ -459,6 +460,20 @@ def test_panoramas_and_lenses_by_other_names(tmp_path):
         for frame in content["frames"]:
             for key in given:
                 del frame[key]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_transforms_of_windows_tools(tmp_path, encoding):
+    content = capture(tmp_path)
+    (tmp_path / "transforms.json").write_text(json.dumps(content), encoding=encoding)
+    assert len(load_transforms(tmp_path).views) == 5
+
+
+def test_masks_among_photos_are_not_counted_as_photos(tmp_path):
+    capture(tmp_path)
+    for photo in list((tmp_path / "images").iterdir()):
+        Image.new("L", (40, 30), 255).save(photo.with_name(f"{photo.stem}_mask.png"))
+    assert "5 of 5 photos have poses" in load_transforms(tmp_path).notes
 
 
 def test_points_at_the_end_of_a_path_of_another_machine(tmp_path):

@@ -1,6 +1,7 @@
 """What scanner apps and Metashape export: poses and intrinsics as they were, depths read past, refusals."""
 
 import json
+import unicodedata
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,12 @@ def test_polycam(tmp_path):
     np.testing.assert_allclose(
         scene.views[0].camera.K, [[17.5, 0, 10.5], [0, 18, 7], [0, 0, 1]]
     )  # at half size
-    assert scene.notes[:2] == ("Polycam's cameras: 4 of 5 have a photo", "2 depth images are not used")
+    assert scene.notes[:4] == (
+        "poses: cameras/ of Polycam",
+        "2 depth images are not used",
+        "4 of 4 photos have poses",
+        "1 of 5 posed photos are gone and left out, first '1004'",
+    )
     assert ("read", scene.notes[0]) in describe(scene)
 
 
@@ -78,8 +84,10 @@ def test_corrected_poses_of_polycam_are_preferred(tmp_path):
     _polycam(tmp_path)
     _polycam(tmp_path, "corrected_cameras", "corrected_images")
     scene = load_scene(tmp_path)
-    assert [view.name for view in scene.views] == [f"corrected_images/{1000 + i}.jpg" for i in range(5)]
-    assert scene.notes[0] == "Polycam's corrected cameras: 5 of 5 have a photo"
+    assert [view.name for view in scene.views] == [f"{1000 + i}.jpg" for i in range(5)]
+    assert scene.views[0].image_path.parent.name == "corrected_images"
+    assert scene.notes[:2] == ("poses: corrected_cameras/ of Polycam", "5 of 5 photos have poses")
+    assert load_scene(tmp_path / "keyframes").notes == scene.notes
     (tmp_path / "keyframes" / "corrected_cameras" / "1002.json").write_text('{"fx": 1}')
     with pytest.raises(SceneError, match=r"1002\.json: not a camera of Polycam .*export the raw data again"):
         load_scene(tmp_path)
@@ -106,7 +114,13 @@ def test_record3d(tmp_path, own):
     _same(scene)
     K = scene.views[2].camera.K
     assert K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == ([32, 31, 20, 15] if own else [35, 36, 21, 14])
-    assert scene.notes[:2] == ("Record3D: 5 of 5 poses have a photo", "5 depth images are not used")
+    assert scene.notes[:3] == (
+        "poses: metadata.json of Record3D",
+        "5 depth images are not used",
+        "5 of 5 photos have poses",
+    )
+    (tmp_path / "metadata.json").rename(tmp_path / "metadata")  # as in an .r3d
+    _same(load_scene(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -116,7 +130,7 @@ def test_record3d(tmp_path, own):
         ({"poses": [[0, 0, 0, 0, 1, 2, 3]]}, "a pose without a rotation"),
         ({"poses": [[0, 0, 0, 1, 1, 2]]}, "not metadata of Record3D"),
         ({"perFrameIntrinsicCoeffs": [[1, 2, 3, 4]]}, "intrinsics of 1 frames for 5 poses"),
-        ({"poses": []}, "no camera with a photo"),
+        ({"poses": []}, "no camera; export it again"),
     ],
 )
 def test_metadata_that_cannot_be_used(tmp_path, change, message):
@@ -189,8 +203,30 @@ def test_metashape(tmp_path, scale, suffix):
     scene = load_scene(tmp_path)
     _same(scene)
     assert [view.name for view in scene.views] == [f"IMG_{i}.JPG" for i in range(5)]
-    assert scene.notes[0] == "cameras.xml of Metashape: 5 of 6 cameras have a pose and a photo"
+    assert scene.notes[:2] == (
+        "poses: cameras.xml of Metashape; 5 of 6 cameras have one",
+        "5 of 5 photos have poses",
+    )
     _same(load_scene(tmp_path / "cameras.xml"))
+
+
+def test_photos_of_metashape_are_found_as_those_of_other_formats(tmp_path):
+    """Beside smaller copies, in other folders, with accents in another form, in UTF-16."""
+    capture, file = tmp_path / "capture", tmp_path / "capture" / "cameras.xml"
+    capture.mkdir()
+    _metashape(capture)
+    labels = file.read_text().replace("IMG_", "Übersicht_").replace("UTF-8", "UTF-16")
+    file.write_bytes(labels.encode("utf-16"))
+    for photo in list(capture.rglob("*.JPG")):
+        name = unicodedata.normalize("NFD", photo.name.replace("IMG_", "Übersicht_"))
+        photo.rename(photo.with_name(name))
+        _photo(capture / "images_2" / name, (20, 15))
+    assert detect(capture) == "metashape"
+    _same(load_scene(capture))
+    (capture / "images").rename(tmp_path / "elsewhere")
+    with pytest.raises(SceneError, match=r"5 of the 5 photos of cameras\.xml are missing.*--images"):
+        load_scene(capture)
+    _same(load_scene(capture, images=tmp_path / "elsewhere"))
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
@@ -216,7 +252,6 @@ def test_lenses_of_metashape(tmp_path, fisheye):
         ("<f>35.0</f>", "<f>nan</f>", "a number that is not finite"),
         ("</document>", "", "no element found"),
         ("<document", "<!DOCTYPE a><document", "too large, or with entities"),
-        ("IMG_", "DSC_", "none of its 6 cameras has a pose and a photo; put photos beside it"),
         ('sensor_id="0"', 'sensor_id="7"', "without a calibrated sensor"),
         ("</cameras></chunk>", "</cameras></chunk><chunk/>", "2 chunks; export one"),
     ],

@@ -1,5 +1,6 @@
 """Pixels that count: from ignored categories, masks of the photos, and their alpha."""
 
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 
@@ -159,6 +160,7 @@ NAMES = (
     "mask/{stem}.PNG",
     "mask/{stem}.mask.png",
     ".mask/{stem}.png",
+    "images/masks/{name}.png",
     "images/{name}.mask.png",
     "images/{stem}_mask.png",
 )
@@ -257,6 +259,46 @@ def test_transparent_pixels_of_a_mask_do_not_count(tmp_path):
     pixels[:2, :, 3] = 0
     Image.fromarray(pixels).save(tmp_path / "a.png")
     assert read_black(tmp_path / "a.png", 16).tolist() == [[False] * 4] * 2 + [[True] * 4] * 2
+
+
+def test_a_mask_may_be_the_alpha_channel(tmp_path):
+    pixels = np.zeros((4, 4, 4), np.uint8)
+    pixels[2:, :, 3] = 255
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert read_black(tmp_path / "a.png", 16).tolist() == [[False] * 4] * 2 + [[True] * 4] * 2
+    Image.new("RGBA", (4, 4), (0, 0, 0, 255)).save(tmp_path / "a.png")
+    assert not read_black(tmp_path / "a.png", 16).any()  # of an opaque one colours tell
+
+
+def test_masks_with_soft_edges(tmp_path):
+    pixels = np.zeros((32, 200), np.uint8)
+    pixels[:, 90:120], pixels[:, 120:] = np.linspace(5, 250, 30).round(), 255
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert holds_masks(tmp_path)
+    pixels[:, 90:120] = 7  # an object of a label image, with 255 for what is none
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert not holds_masks(tmp_path)
+
+
+def test_masks_beside_the_photos_of_each_camera(tmp_path, scene):
+    """With equal names of photos, and accents in another form than theirs."""
+    views = []
+    for row, view in enumerate(scene.views):
+        name = f"cam{row % 2}/images/{unicodedata.normalize('NFC', 'ä')}{row // 2}.png"
+        photo = tmp_path / "rig" / name
+        photo.parent.mkdir(parents=True, exist_ok=True)
+        view.image_path.rename(photo)
+        mask = np.full((32, 48), 255, np.uint8)
+        mask[:, : 12 + 12 * (row % 2)] = 0
+        path = photo.parents[1] / "masks" / unicodedata.normalize("NFD", photo.name)
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(mask).save(path)
+        views.append(replace(view, name=name, image_path=photo))
+    rig = replace(scene, path=tmp_path / "rig", views=tuple(views))
+    assert "masks of 4 of 4 photos" in describe_masks(rig)
+    assert write_valid(rig, tmp_path / "valid").tolist() == [0.25, 0.5, 0.25, 0.5]
+    photos, _ = prepare_photos(tmp_path / "rig", tmp_path / "p", tmp_path / "o", lambda done, total: None)
+    assert len(photos) == 4
 
 
 def test_masks_are_no_photos_to_find_poses_of(tmp_path):

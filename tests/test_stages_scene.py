@@ -104,5 +104,8 @@ def test_poses_that_are_not_read_are_named_before_others_are_estimated(tmp_path:
     shutil.rmtree(tmp_path / "capture/sparse")
     (line,) = said(2)
     assert line.startswith(f"{photos}/reconstruction.json: poses of a format that is not read")
-    (photos / "reconstruction.json").unlink()
-    assert said(3) == []
+    (photos / "reconstruction.json").rename(tmp_path / "capture/transforms.json")
+    (line,) = said(3)
+    assert line.startswith(f"{tmp_path}/capture/transforms.json: poses of a file that was not given")
+    (tmp_path / "capture/transforms.json").unlink()
+    assert said(4) == []

@@ -34,10 +34,7 @@ def in_srgb(image: Image.Image) -> Image.Image:
     Modes with a profile become RGB or RGBA. 16 bits are left alone.
     """
     content = image.info.get("icc_profile")
-    if not content or image.mode.startswith("I") or image.mode == "F":
-        return image
-    profile = profile_of(content)
-    if profile.kind != "other" or image.mode not in _FITTING.get(profile.mode, (image.mode,)):
+    if not content or not _converts(profile := profile_of(content), image):
         return image
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
     plain = image if image.mode == profile.mode else image.convert(profile.mode)
@@ -45,6 +42,12 @@ def in_srgb(image: Image.Image) -> Image.Image:
     if alpha is not None:
         converted.putalpha(alpha)
     return converted
+
+
+def _converts(profile: Profile, image: Image.Image) -> bool:
+    """Whether colours change: not in pictures of another kind than the profile's, nor in 16 bits of grey."""
+    plain = not image.mode.startswith("I") and image.mode != "F"
+    return plain and profile.kind == "other" and image.mode in _FITTING.get(profile.mode, (image.mode,))
 
 
 @lru_cache(maxsize=64)
@@ -89,19 +92,21 @@ def _transformed(image: Image.Image, content: bytes, mode: str) -> Image.Image:
 
 def describe_profiles(paths: Iterable[Path]) -> list[str]:
     """What is done about the colour profiles of photos, in words; nothing about those in sRGB."""
-    names, damaged = Counter[str](), list[Path]()
+    names, unfit, damaged = Counter[str](), Counter[str](), list[Path]()
     for path in paths:
         try:
             with open_picture(path, decodes=False) as image:
                 content = image.info.get("icc_profile")
+                profile = profile_of(content) if content else None
+                converts = profile is not None and _converts(profile, image)
         except PictureError:
             continue  # whoever reads it says why
-        profile = profile_of(content) if content else None
         if profile is not None and profile.kind == "other":
-            names[profile.name] += 1
+            (names if converts else unfit)[profile.name] += 1
         if profile is not None and profile.kind == "damaged":
             damaged.append(path)
     lines = [f"photos converted from {name} to sRGB: {count}" for name, count in names.items()]
+    lines += [f"photos that the profile {name} is not for, read without it: {n}" for name, n in unfit.items()]
     if damaged:
         lines.append(
             f"photos with a damaged colour profile, read as sRGB: {len(damaged)}, first {damaged[0]}"

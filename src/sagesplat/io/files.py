@@ -232,13 +232,23 @@ def read_json(path: Path, cure: str = "", error: type[SageError] = RunError) -> 
     """The content of a JSON file; `error` if it is unreadable, with a `cure`. Memory: 64 bytes per byte."""
     cure = cure and f"; {cure}"
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(decoded(path.read_bytes()))
     except FileNotFoundError:
         raise error(f"{path}: no such file{cure}") from None
     except RecursionError:
         raise error(f"{path}: not readable as JSON (nested too deeply){cure}") from None
     except (OSError, ValueError) as reason:
         raise error(f"{path}: not readable as JSON ({short(reason)}){cure}") from reason
+
+
+def decoded(content: bytes, errors: str = "strict") -> str:
+    """A text file of any machine: with or without a byte order mark, which Windows puts before UTF-8 and -16.
+
+    `errors`: what becomes of bytes that are not UTF-8, as in `bytes.decode`.
+    """
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16")
+    return content.removeprefix(b"\xef\xbb\xbf").decode("utf-8", errors)
 
 
 def regular(path: Path) -> Path:

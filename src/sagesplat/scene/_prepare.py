@@ -16,7 +16,7 @@ from sagesplat.io.files import atomic_path, link
 from sagesplat.io.pictures import PictureError, open_picture
 from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.exif import DETAILS, exif_of
-from sagesplat.scene.given_masks import holds_masks, is_mask_among, mask_folders
+from sagesplat.scene.given_masks import holds_masks, is_mask_among, mask_folders_below
 from sagesplat.scene.images import as_rgb
 
 _LONGEST, _ROOM = 250, 30  # bytes of a name, and what is left of them for suffixes
@@ -77,7 +77,7 @@ def _list(source: Path, skipped: Path) -> list[Path]:
     """Photos below a folder, without hidden ones and masks, sorted by name with numbers by value."""
     skipped, masks = (
         skipped.resolve(),
-        [folder for folder in mask_folders(source) if _holds_no_photos(folder)],
+        [folder for folder in mask_folders_below(source) if _holds_no_photos(folder)],
     )
     outside = not source.resolve().is_relative_to(skipped)
     photos = []

@@ -92,7 +92,7 @@ def _of_transforms(path: Path, images: Path | None) -> list[NamedCamera]:
 
 @dataclass(frozen=True, eq=False)
 class _Of3dgs:
-    """An entry of 3DGS's cameras.json; the principal point is the middle."""
+    """An entry of 3DGS's cameras.json; the principal point is the middle, where other tools name none."""
 
     rotation: Float64[np.ndarray, "3 3"]
     position: Float64[np.ndarray, " 3"]
@@ -101,6 +101,8 @@ class _Of3dgs:
     width: Side
     height: Side
     img_name: Any = None
+    cx: float | None = None
+    cy: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +133,9 @@ class ViewpointsFile:
 def _of_3dgs(entry: _Of3dgs, number: int, offset: Position) -> NamedCamera:
     w2c = np.eye(4)
     w2c[:3, :3], w2c[:3, 3] = entry.rotation.T, -entry.rotation.T @ (entry.position - np.array(offset))
-    K = np.array([[entry.fx, 0, entry.width / 2], [0, entry.fy, entry.height / 2], [0, 0, 1]])
+    cx = entry.width / 2 if entry.cx is None else entry.cx
+    cy = entry.height / 2 if entry.cy is None else entry.cy
+    K = np.array([[entry.fx, 0, cx], [0, entry.fy, cy], [0, 0, 1]])
     given = entry.img_name
     name = repaired(given) if isinstance(given, str) and given else f"{number:03}"
     return NamedCamera(name, _camera(w2c, K, entry.width, entry.height), offset=offset)

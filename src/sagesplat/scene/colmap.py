@@ -23,7 +23,8 @@ from sagesplat.scene.loading import (
     describe_photos,
     views_of,
 )
-from sagesplat.scene.points import random_points, read_points
+from sagesplat.scene.points import random_points, read_points, seen_or_random
+from sagesplat.scene.raw_photos import photos_before
 from sagesplat.scene.scene import Lens, Points, Scene, View
 from sagesplat.scene.undistort import FACES, SPHERE, distort, intrinsics
 
@@ -52,7 +53,7 @@ def load_colmap(
         cameras, listed, points = read_model(chosen.folder)
         _check_names(chosen.folder, listed)
         listed = _there(chosen, listed)
-        notes += describe_photos(chosen.photos)
+        notes += describe_photos(chosen.photos, photos_before(path))
         files, divisor = at_downscale(chosen.photos, downscale)
         listed = sorted(listed, key=lambda image: chosen.photos.files[image.name])
         offset, listed, points = _near_origin(listed, points)
@@ -61,7 +62,10 @@ def load_colmap(
         tracked = _scene_points(chosen.folder, cameras, [listed[row] for row in rows], views, points)
         if tracked is None:
             tracked, more = _points_beside(path, chosen.folder, views, offset)
-            notes.append(more)
+            notes += more
+        elif not len(tracked.track_points):
+            tracked, more = seen_or_random(tracked, views, "the model")
+            notes += more
     home = _home(path, chosen.photos.folder)
     name = repaired((home if home.absolute() in path.absolute().parents else path).resolve().name)
     return Scene(name, home, views, tracked, test_every, notes=tuple(notes), offset=offset)
@@ -99,16 +103,19 @@ def _there(chosen: FoundModel, listed: Sequence[ModelImage]) -> list[ModelImage]
     return [image for image in listed if image.name in chosen.photos.files]
 
 
-def _points_beside(path: Path, model: Path, views: Sequence[View], offset: Position) -> tuple[Points, str]:
+def _points_beside(
+    path: Path, model: Path, views: Sequence[View], offset: Position
+) -> tuple[Points, list[str]]:
     """The points of a capture whose model has none: those of a PLY file beside it, else random ones."""
     for folder in dict.fromkeys((model, model.parent, path)):
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() == ".ply")
         named = [file for file in files if file.stem.lower() in POINT_FILES]
         for file in named or files[: folder == model and len(files) == 1]:
-            points = read_points(file, offset)
-            return points, f"the model has no 3D points: training begins with those of {short(file.name)}"
+            points, notes = seen_or_random(read_points(file, offset), views, short(file.name))
+            line = f"the model has no 3D points: training begins with those of {short(file.name)}"
+            return points, notes or [line]
     points = random_points(views)
-    return points, f"no 3D points: training begins with {len(points.xyz):,} random ones that cameras see"
+    return points, [f"no 3D points: training begins with {len(points.xyz):,} random ones that cameras see"]
 
 
 def _check_names(model: Path, listed: Sequence[ModelImage]) -> None:

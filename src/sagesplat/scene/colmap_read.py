@@ -4,6 +4,7 @@ Format: https://colmap.github.io/format.html. Models since 3.12 also have rigs a
 since images still hold their own poses.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from jaxtyping import Float64, Int64, UInt8
 from scipy.spatial.transform import Rotation
 
 from sagesplat.core.errors import SceneError, short
+from sagesplat.io.files import decoded
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
 from sagesplat.scene.undistort import CAMERA_MODELS
 
@@ -54,7 +56,7 @@ def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], 
     cameras = _read(folder, "cameras", _binary_cameras, _text_cameras)
     listed = _read(folder, "images", _binary_images, _text_images)
     points = None
-    if any((folder / f"points3D{suffix}").is_file() for suffix in _SUFFIXES):
+    if any(model_file(folder, f"points3D{suffix}") for suffix in _SUFFIXES):
         points = _read(folder, "points3D", _binary_points, _text_points)
     ids = np.zeros(0, np.int64) if points is None else points.ids
 
@@ -67,8 +69,19 @@ def read_model(folder: Path) -> tuple[dict[int, ModelCamera], list[ModelImage], 
     return cameras, [replace(i, point_rows=rows(i.point_rows)) for i in listed], points
 
 
+def model_file(folder: Path, name: str) -> Path | None:
+    """The file of a name in the folder of a model, whatever its case; None where it is not there."""
+    if (file := folder / name).is_file():
+        return file
+    try:
+        others = sorted(entry.path for entry in os.scandir(folder) if entry.name.lower() == name.lower())
+    except OSError:
+        return None
+    return next((Path(other) for other in others if os.path.isfile(other)), None)
+
+
 def _read(folder: Path, part: str, binary: Callable, text: Callable) -> Any:
-    path = next((p for s in _SUFFIXES if (p := folder / f"{part}{s}").is_file()), folder / f"{part}.txt")
+    path = next((file for s in _SUFFIXES if (file := model_file(folder, part + s))), folder / f"{part}.txt")
     try:
         content = path.read_bytes()
         if path.suffix == ".bin":
@@ -77,23 +90,14 @@ def _read(folder: Path, part: str, binary: Callable, text: Callable) -> Any:
             if data.at != len(data.data):
                 raise ValueError(f"{len(data.data) - data.at} bytes more than expected")
             return value
-        return text(path, [line.strip() for line in _decoded(content).split("\n")])
+        lines = decoded(content, "surrogateescape").replace("\r", "\n").split("\n")  # paths may be no UTF-8
+        return text(path, [line.strip() for line in lines])
     except FileNotFoundError:
         raise SceneError(f"{path}: no such file; copy the whole model (cameras, images, points3D)") from None
     except (OSError, ValueError, IndexError, OverflowError) as error:
         raise SceneError(
             f"{path}: damaged or incomplete ({short(error)}); copy or export the model again"
         ) from None
-
-
-def _decoded(content: bytes) -> str:
-    """A text file of any machine: with or without a byte order mark, which Windows puts before UTF-8 and -16.
-
-    Bytes that are not UTF-8 stay what they are in paths: a photo may be named so.
-    """
-    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return content.decode("utf-16")
-    return content.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "surrogateescape")
 
 
 class _Bytes:
@@ -135,9 +139,12 @@ def _binary_cameras(path: Path, data: _Bytes) -> dict[int, ModelCamera]:
 def _text_cameras(path: Path, lines: list[str]) -> dict[int, ModelCamera]:
     cameras = {}
     for line in _records(lines):
-        id, model, width, height, *params = line.split()
+        id, model, *values = line.split()
+        width, height, *params = map(float, values)  # tools other than COLMAP write sizes as 96.0, too
+        if width % 1 or height % 1:
+            raise ValueError(f"camera {id}: size {width} x {height} is not of whole pixels")
         name = model.upper() if model.upper() in CAMERA_MODELS else _unknown_model(path, model)
-        cameras[int(id)] = camera_of_model(int(id), name, int(width), int(height), [float(p) for p in params])
+        cameras[int(id)] = camera_of_model(int(id), name, int(width), int(height), params)
     return cameras
 
 

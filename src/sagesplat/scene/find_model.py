@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sagesplat.core.errors import SceneError, short
-from sagesplat.scene.colmap_read import read_names
+from sagesplat.scene.colmap_read import model_file, read_names
 from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTO_FOLDERS, PHOTOS, Found, PhotoFolder, folders_of
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
@@ -73,19 +73,23 @@ def find_model(path: Path, images: Path | None = None) -> tuple[FoundModel, list
 
 
 def _describe(path: Path, best: FoundModel, others: dict[Path, str]) -> list[str]:
-    below = best.folder.relative_to(path).as_posix()
+    def named(folder: Path) -> str:
+        below = folder.relative_to(path).as_posix()
+        return "the folder itself" if below == "." else short(below)
+
     if not others:
-        return [] if below in USUAL else [f"poses: those of {'the folder itself' if below == '.' else below}"]
-    rest = [f"{short(folder.relative_to(path).as_posix())} ({what})" for folder, what in others.items()]
+        usual = best.folder.relative_to(path).as_posix() in USUAL
+        return [] if usual else [f"poses: those of {named(best.folder)}"]
+    rest = [f"{named(folder)} ({what})" for folder, what in others.items()]
     more = f" and {len(rest) - 3} more" if len(rest) > 3 else ""
     return [
-        f"poses: those of {short(below)}, which of {len(others) + 1} models has the most photos; left aside: "
-        f"{', '.join(rest[:3])}{more}; to take another one, give its folder"
+        f"poses: those of {named(best.folder)}, which of {len(others) + 1} models has the most photos; left "
+        f"aside: {', '.join(rest[:3])}{more}; to take another one, give its folder"
     ]
 
 
 def _holds_model(folder: Path) -> bool:
-    return any(os.path.isfile(folder / name) for name in (*MODEL_FILES, "images.bin"))  # if in part
+    return any(model_file(folder, name) for name in (*MODEL_FILES, "images.bin"))  # if in part
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:

@@ -42,9 +42,14 @@ class Found:
 
     @cached_property
     def written_differently(self) -> str:
-        """One line on the names that are not those of the files; empty where all are."""
+        """One line on the names that are not those of the files; empty where all are.
+
+        A bare name, without folder and suffix, is that of any picture of this name.
+        """
         changed = [
-            (name, file) for name, file in self.files.items() if name.removeprefix("./") != self.prefix + file
+            (name, file)
+            for name, file in self.files.items()
+            if name.removeprefix("./") != self.prefix + file and name != PurePosixPath(file).stem
         ]
         if not changed:
             return ""

@@ -1,22 +1,22 @@
 """Masks that came with photos, under the names that trainers and photogrammetry give them.
 
-Folders beside the photos: masks_valid/, masks/, mask/, segmentation/, .mask/ (RealityScan). Names, of x.jpg:
-x.png, x.jpg.png (COLMAP), x.jpg.mask.png (RealityScan, Brush), x.mask.png, x_mask.png (Metashape), and
-mask_x.png; or other pictures.
-Those with the word "mask" may also lie among the photos. Black pixels do not count, as in nerfstudio, COLMAP,
-RealityScan, Metashape, Brush and LichtFeld Studio. In masks_inverted/, and dynamic_mask_x.png of instant-ngp,
-it is the white ones.
+Folders beside the photos, or beside those of one camera: masks_valid/, masks/, mask/, segmentation/, .mask/
+(RealityScan). Names, of x.jpg: x.png, x.jpg.png (COLMAP), x.jpg.mask.png (RealityScan, Brush), x.mask.png,
+x_mask.png (Metashape), and mask_x.png; or other pictures. Those with the word "mask" may also lie among the
+photos. Edges may be soft. Black pixels do not count, as in nerfstudio, COLMAP, RealityScan, Metashape, Brush
+and LichtFeld Studio. In masks_inverted/, and dynamic_mask_x.png of instant-ngp, it is the white ones.
 
 Label images may lie in masks/ and mask/, too: with a labels.json, or of other values than two.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
 from jaxtyping import Bool
 
+from sagesplat.core.names import collision_key
 from sagesplat.io.pictures import FREE_PIXELS, PHOTO_FORMATS, PictureError, open_picture
 from sagesplat.scene.images import read_black
 
@@ -26,6 +26,7 @@ FOLDERS = (VALID_FOLDER, "masks", "mask", "segmentation", ".mask", INVERTED_FOLD
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _LOOKED_AT = 8  # images that tell masks from label images
 _BETWEEN = 0.02  # share of pixels that edges of masks may have between black and white
+_SOFT, _SOFT_VALUES = 0.2, 16  # the same of soft masks, whose edges have at least so many values
 _NEAR = 32  # grey values from black and white that lossy compression makes
 
 
@@ -48,8 +49,12 @@ class GivenMasks:
         """`bases`: folders that may hold mask folders; `photos`: of the photos; `more`: a folder of masks."""
         places = [more] if more is not None else []
         places += [folder for base in dict.fromkeys(bases) for folder in mask_folders(base)]
-        self.folders = [folder for folder in places if holds_masks(folder)]
-        self._indices = [(folder, _index(folder)) for folder in self.folders]
+        inside = [folder for folder in mask_folders_below(photos) if folder not in places]
+        self.folders = [folder for folder in (*places, *inside) if holds_masks(folder)]
+        self._indices = [
+            (folder, _key(folder.parent.relative_to(photos)) if folder in inside else "", _index(folder))
+            for folder in self.folders
+        ]
         self._among = _index(photos) if photos.is_dir() else {}
 
     def __bool__(self) -> bool:
@@ -63,14 +68,15 @@ class GivenMasks:
 
     def of(self, photo: str) -> GivenMask | None:
         """The mask of a photo, by its name below the folder of the photos."""
-        names = list(_names(photo))
-        for folder, index in self._indices:
+        key = _key(PurePosixPath(photo))
+        names = list(_names(key))
+        for folder, above, index in self._indices:
             inverted = folder.name.lower() == INVERTED_FOLDER
-            for name, turned in names:
+            for name, turned in _names(_below(key, above)) if above else names:
                 if name in index:
                     return GivenMask(index[name], inverted ^ turned)
         for name, turned in names:
-            named = "mask" in PurePosixPath(name).name and photo.lower() != name
+            named = "mask" in PurePosixPath(name).name and key != name
             if named and name in self._among and _is_two_valued(self._among[name]):
                 return GivenMask(self._among[name], turned)
         return None
@@ -80,9 +86,20 @@ def _is_below(path: Path, folders: Sequence[Path]) -> bool:
     return any(path.is_relative_to(folder) for folder in folders)
 
 
+def _key(path: PurePath) -> str:
+    """A path whatever its case and form of Unicode; empty for that of a folder to itself."""
+    return collision_key("/".join(path.parts))
+
+
+def _below(photo: str, above: str) -> str:
+    """The path of a photo below a folder, without the folder of the photos there; empty for another's."""
+    below = photo.removeprefix(f"{above}/")
+    return "" if below == photo else below.removeprefix("images/")
+
+
 def _names(photo: str) -> Iterator[tuple[str, bool]]:
-    """Names that a photo's mask may have, in lower case, and whether they say that it is inverted."""
-    path = PurePosixPath(photo.lower())
+    """Keys that a photo's mask may have, by its own one, and whether they say that it is inverted."""
+    path = PurePosixPath(photo)
     forms = ("{0}", "{1}", "{0}.mask", "{1}.mask", "{1}_mask", "{0}_mask", "mask_{1}", "dynamic_mask_{1}")
     for folder in dict.fromkeys((path.parent, PurePosixPath())):  # or all masks in one folder
         for form in forms:
@@ -102,9 +119,9 @@ def is_mask_among(path: Path, names: frozenset[str]) -> bool:
 
 
 def _index(folder: Path) -> dict[str, Path]:
-    """The pictures below a folder by their path in it, in lower case."""
+    """The pictures below a folder by the key of their path in it."""
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES and path.is_file())
-    return {path.relative_to(folder).as_posix().lower(): path for path in files}
+    return {_key(path.relative_to(folder)): path for path in files}
 
 
 def mask_folders(base: Path) -> list[Path]:
@@ -113,6 +130,11 @@ def mask_folders(base: Path) -> list[Path]:
         return []
     named = [path for path in base.iterdir() if path.name.lower() in FOLDERS and path.is_dir()]
     return sorted(named, key=lambda path: FOLDERS.index(path.name.lower()))
+
+
+def mask_folders_below(folder: Path) -> list[Path]:
+    """The folders that are named for masks, in a folder or below it: of photos by several cameras."""
+    return sorted(path for path in folder.rglob("*") if path.name.lower() in FOLDERS and path.is_dir())
 
 
 def holds_masks(folder: Path) -> bool:
@@ -145,7 +167,8 @@ def _is_two_valued(path: Path) -> bool:
         return False
     near = _NEAR if lossy else 0
     between = (values > near) & (values < (255 if lossy else most) - near)
-    return float(between.mean()) <= _BETWEEN
+    share = float(between.mean())
+    return share <= _BETWEEN or (share <= _SOFT and len(np.unique(values[between])) >= _SOFT_VALUES)
 
 
 def mask_of_photo(masks: GivenMasks, photo: str) -> GivenMask | None:

@@ -64,7 +64,8 @@ def _clear_border(alpha: UInt8[np.ndarray, "h w"]) -> float:
 def read_black(path: Path, pixels: int) -> Bool[np.ndarray, "h w"]:
     """Where a mask of any mode is not black; `pixels`: of its photo. SceneError for what is no image.
 
-    In formats that compress with loss what is darker than the middle is black. So is what is transparent.
+    In formats that compress with loss what is darker than the middle is black. So is what is transparent;
+    a mask of one colour is in the alpha channel alone.
     """
     try:
         with open_picture(path, free=max(FREE_PIXELS, 4 * pixels)) as image:
@@ -77,6 +78,8 @@ def read_black(path: Path, pixels: int) -> Bool[np.ndarray, "h w"]:
     except PictureError as error:
         cure = error.cure or "export it again"
         raise SceneError(f"{path}: not a readable mask ({error.reason}); {cure}") from None
+    if clear is not None and clear.any() and not clear.all() and (values == values[:1, :1]).all():
+        return ~clear
     counts = np.array((values > least).any(2) if values.ndim == 3 else values > least, bool)
     return counts if clear is None else counts & ~clear
 

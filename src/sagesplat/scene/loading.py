@@ -1,5 +1,6 @@
 """Shared by the loaders of captures: checks of settings, views of photos, and what is said about them."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -10,6 +11,7 @@ from jaxtyping import Float
 
 from sagesplat.core.errors import SceneError, short
 from sagesplat.scene.find_photos import PHOTO_FOLDERS, Found, PhotoFolder
+from sagesplat.scene.given_masks import is_mask_among
 from sagesplat.scene.images import photo_size
 from sagesplat.scene.scene import Camera, Lens, View
 from sagesplat.scene.undistort import (
@@ -67,10 +69,18 @@ def at_downscale(photos: Found, downscale: int) -> tuple[dict[str, Path], int]:
     return {name: small / found.files[file] for name, file in photos.files.items()}, 1
 
 
-def describe_photos(photos: Found) -> list[str]:
-    """Lines on the photos that poses are for: how many of how many have one, which are gone or renamed."""
-    total = len(PhotoFolder(photos.folder).files)
-    lines = [f"{len(photos.files)} of {max(total, len(photos.files))} photos have poses"]
+def describe_photos(photos: Found, least: int = 0) -> list[str]:
+    """Lines on the photos that poses are for: how many of how many have one, which are gone or renamed.
+
+    `least`: photos that there were, of which those without poses may have been left out.
+    """
+    posed = set(photos.files.values())
+    rest = [Path(file.written) for file in PhotoFolder(photos.folder).files if file.written not in posed]
+    beside: dict[Path, set[str]] = defaultdict(set)
+    for file in (*map(Path, posed), *rest):
+        beside[file.parent].add(file.name.lower())
+    rest = [file for file in rest if not is_mask_among(photos.folder / file, frozenset(beside[file.parent]))]
+    lines = [f"{len(posed)} of {max(least, len(posed) + len(rest))} photos have poses"]
     if missing := photos.missing:
         first = short(repr(missing[0]))
         lines.append(

@@ -34,7 +34,7 @@ from sagesplat.scene.loading import (
     describe_photos,
     views_of,
 )
-from sagesplat.scene.points import random_points, read_points
+from sagesplat.scene.points import random_points, read_points, seen_or_random
 from sagesplat.scene.scene import Camera, Lens, Scene, View
 from sagesplat.scene.undistort import SPHERE, pinhole
 
@@ -149,6 +149,9 @@ def load_transforms(
     if points is None:
         points = random_points(ordered)
         notes.append(f"no points: training begins with {len(points.xyz):,} random ones that cameras see")
+    else:
+        points, more = seen_or_random(points, ordered, short(transforms.ply_file_path or ""))
+        notes += more
     folder = file.parent
     return Scene(
         repaired(folder.resolve().name), folder, ordered, points, test_every, test_names=test_names,
@@ -291,7 +294,7 @@ def _views(
     root = images or file.parent
     photos = PhotoFolder(root).find(written)
     check_found(photos, file.name)
-    if images is None and all(name.startswith("images/") for name in photos.files.values()):
+    if all(name.startswith("images/") for name in photos.files.values()):
         root = root / "images"
         files = {name: found.removeprefix("images/") for name, found in photos.files.items()}
         photos = Found(root, written, files, prefix="images/")
@@ -417,9 +420,7 @@ def _listed_split(
 ) -> tuple[list[View], frozenset[str] | None]:
     """The views that the file's lists name, and the names of the test views (None without lists)."""
     lists = {
-        kind: names
-        for kind in ("train", "test", "val")
-        if (names := getattr(content, f"{kind}_filenames")) is not None
+        kind: names for kind in ("train", "test", "val") if (names := getattr(content, f"{kind}_filenames"))
     }
     views = [view for _, of_frame in by_frame for view in of_frame]
     if not lists:
@@ -430,11 +431,10 @@ def _listed_split(
     for kind, given in lists.items():
         listed = [plain(_written(file, f"{kind}_filenames", name)) for name in given]
         unknown = [name for name in listed if name not in every]
-        if not listed or unknown:
-            first = f", first {short(repr(unknown[0]))}" if unknown else ""
+        if unknown:
             raise SceneError(
-                f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame{first}; "
-                "list the file_path of frames, or leave the list out"
+                f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame, first "
+                f"{short(repr(unknown[0]))}; list the file_path of frames, or leave the list out"
             )
         names[kind] = set().union(
             *(of_frames.get(name, ()) for name in listed)

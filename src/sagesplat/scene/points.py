@@ -75,6 +75,21 @@ def read_points(path: Path, offset: Position = geometry.NO_OFFSET) -> Points:
     return untracked(xyz, rgb)
 
 
+def seen_or_random(points: Points, views: Sequence[View], of: str) -> tuple[Points, list[str]]:
+    """Points of a file for views without tracks; random ones, which a line says, where no view sees any.
+
+    Points and poses are then of different origins or axes: one of both in UTM, or turned.
+    """
+    with np.errstate(all="ignore"):
+        if any(_inside(points.xyz, view)[0].any() for view in views):
+            return points, []
+    made = random_points(views)
+    return made, [
+        f"no photo shows any of the {len(points.xyz):,} points of {of}: their origin or axes are not those "
+        f"of the poses; training begins with {len(made.xyz):,} random points"
+    ]
+
+
 def random_points(views: Sequence[View], count: int = 100_000, *, cube: float | None = None) -> Points:
     """`count` random initial points, without tracks.
 

@@ -20,6 +20,7 @@ from sagesplat.scene.colmap_read import CAMERA_MODELS, camera_of_model, read_mod
 from sagesplat.scene.scene import Lens
 
 REPORT = "poses.json"
+_WHAT, _CURE = "a report of poses", "find the poses again, or remove it"
 _SIDEWAYS = range(5, 9)  # EXIF orientations that exchange width and height
 
 
@@ -93,6 +94,20 @@ class _Raw:
 @dataclass(frozen=True)
 class _Report:
     raw: _Raw = field(default_factory=_Raw)
+    num_photos: Count = 0
+
+
+def _report(path: Path) -> _Report:
+    """The report at a path; an empty one where there is none. SceneError for a damaged one."""
+    return read_json_as(path, _Report, _WHAT, _CURE, SceneError) if path.is_file() else _Report()
+
+
+def photos_before(capture: Path) -> int:
+    """How many photos structure from motion was given for a capture; 0 where it did not make it.
+
+    SceneError for a damaged poses.json.
+    """
+    return _report(capture / REPORT).num_photos
 
 
 def raw_photos(capture: Path) -> dict[str, RawPhoto]:
@@ -101,11 +116,8 @@ def raw_photos(capture: Path) -> dict[str, RawPhoto]:
     SceneError for a damaged poses.json.
     """
     path = capture / REPORT
-    if not path.is_file():
-        return {}
-    what, cure = "a report of poses", "find the poses again, or remove it"
-    raw = read_json_as(path, _Report, what, cure, SceneError).raw
-    with refused(path, what, cure, SceneError):
+    raw = _report(path).raw
+    with refused(path, _WHAT, _CURE, SceneError):
         lenses = []
         for index, one in enumerate(raw.lenses):
             c = camera_of_model(index, one.model, one.width, one.height, one.params)

@@ -1,13 +1,13 @@
 """Loads what scanner apps and Metashape export: Polycam's and Record3D's folders, cameras in Metashape's XML.
 
 Each is turned into the frames of a transforms.json, which `nerfstudio.load_transforms` loads: camera to world
-with OpenGL axes, in the file's own world. Depth images are not read.
+with OpenGL axes, in the file's own world. Photos are found by `find_photos`. Depth images are not read.
 
 Polycam, raw data: keyframes/images/N.jpg with keyframes/cameras/N.json, or corrected_images and
 corrected_cameras, which Polycam made by bundle adjustment. Record3D: rgbd/N.jpg or rgb/N.jpg, and
-metadata.json with `K` (by columns), `poses` (quaternion x y z w, then the position) and
-`perFrameIntrinsicCoeffs`. Metashape: "Export Cameras" as Agisoft XML; camera models are those of its manual,
-appendix D.
+metadata.json (metadata in an unpacked .r3d) with `K` (by columns), `poses` (quaternion x y z w, then the
+position) and `perFrameIntrinsicCoeffs`. Metashape: "Export Cameras" as Agisoft XML; camera models are those
+of its manual, appendix D.
 """
 
 from collections.abc import Iterator
@@ -25,11 +25,9 @@ from sagesplat.core.errors import SceneError, short
 from sagesplat.core.names import repaired
 from sagesplat.io.files import read_json, regular
 from sagesplat.io.typed import convert_as, refused
-from sagesplat.scene.given_masks import FOLDERS
 from sagesplat.scene.nerfstudio import LARGEST, load_transforms
 from sagesplat.scene.scene import Scene
 
-_PICTURES = (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff", ".webp")
 _DEPTHS = (".depth", ".exr")  # files of Record3D, besides folders named depth
 _LARGEST_XML = 2**26  # bytes; a camera takes about a thousand
 _NO_PIXELS = 0.5  # by which coefficients that other camera models lack may move a photo's corner
@@ -52,18 +50,18 @@ def load_polycam(path: Path, **reading: Any) -> Scene:
     kind = "corrected_" if cameras.name == "corrected_cameras" else ""
     photos = cameras.with_name(f"{kind}images")
     photos = photos if photos.is_dir() else cameras.with_name("images")
-    files, by_stem = sorted(cameras.glob("*.json"), key=_number), _pictures(photos)
-    frames = [
-        _polycam_frame(file, by_stem[file.stem.lower()]) for file in files if file.stem.lower() in by_stem
-    ]
-    notes = [f"Polycam's {cameras.name.replace('_', ' ')}: {len(frames)} of {len(files)} have a photo"]
+    frames = [_polycam_frame(file) for file in sorted(cameras.glob("*.json"), key=_number)]
+    notes = [f"poses: {cameras.name}/ of Polycam"]
     notes += _depth_notes(cameras.parent, "depth", "confidence")
-    return _scene(path, cameras, frames, notes, reading)
+    return _scene(path, cameras, frames, photos, notes, reading)
 
 
 def _polycam_cameras(folder: Path) -> Path | None:
     """The folder with the poses: corrected ones, where there are some."""
-    places = (folder / "keyframes" / name for name in ("corrected_cameras", "cameras"))
+    names = [name for name in ("corrected_cameras", "cameras") if (folder / "keyframes" / name).is_dir()]
+    places = [folder / "keyframes" / name for name in names]
+    if not names and folder.name == "keyframes":
+        places = [folder / "corrected_cameras", folder / "cameras"]
     return next((place for place in places if next(place.glob("*.json"), None)), None)
 
 
@@ -98,16 +96,21 @@ class _PolycamCamera:
         }  # fmt: skip
 
 
-def _polycam_frame(file: Path, photo: Path) -> dict[str, Any]:
+def _polycam_frame(file: Path) -> dict[str, Any]:
     content = read_json(file, "export the raw data again", SceneError)
     with refused(file, "a camera of Polycam", "export the raw data again", SceneError):
         camera = convert_as(content, _PolycamCamera)
-    return camera.frame(photo.relative_to(file.parents[1]).as_posix())
+    return camera.frame(file.stem)
 
 
 def is_record3d(folder: Path) -> bool:
     """Whether a folder is Record3D's export of photos with metadata."""
-    return (folder / "metadata.json").is_file() and _record3d_photos(folder) is not None
+    return _record3d_file(folder).is_file() and _record3d_photos(folder) is not None
+
+
+def _record3d_file(folder: Path) -> Path:
+    inside = folder / "metadata"  # in an .r3d, which is an archive
+    return inside if inside.is_file() else folder / "metadata.json"
 
 
 def _record3d_photos(folder: Path) -> Path | None:
@@ -125,7 +128,7 @@ class _Record3D:
 
 def load_record3d(path: Path, **reading: Any) -> Scene:
     """The scene of Record3D's photos and metadata.json; `reading` as of `load_transforms`. SceneError."""
-    file, photos = path / "metadata.json", _record3d_photos(path)
+    file, photos = _record3d_file(path), _record3d_photos(path)
     if photos is None:
         raise SceneError(f"{path}: no rgbd/ or rgb/ beside metadata.json; export it again, with photos")
     content = read_json(file, "export it from Record3D again", SceneError)
@@ -137,20 +140,17 @@ def load_record3d(path: Path, **reading: Any) -> Scene:
         poses = np.array(made.poses, np.float64).reshape(-1, 7)
         if not (np.linalg.norm(poses[:, :4], axis=1) > 1e-6).all():
             raise ValueError("a pose without a rotation")
-    by_stem, frames = _pictures(photos), []
+    frames = []
     for number, pose in enumerate(poses):
-        if (photo := by_stem.get(str(number))) is None:
-            continue
         c2w = np.eye(4)
         c2w[:3, :3], c2w[:3, 3] = Rotation.from_quat(pose[:4]).as_matrix(), pose[4:]
         fx, fy, cx, cy = own[number][:4] if own else (made.K[0], made.K[4], made.K[6], made.K[7])
         frames.append({
-            "file_path": photo.relative_to(path).as_posix(), "w": made.w, "h": made.h, "fl_x": fx, "fl_y": fy,
+            "file_path": str(number), "w": made.w, "h": made.h, "fl_x": fx, "fl_y": fy,
             "cx": cx, "cy": cy, "transform_matrix": c2w.tolist(),
         })  # fmt: skip
-    notes = [f"Record3D: {len(frames)} of {len(poses)} poses have a photo"]
-    notes += _depth_notes(path, "depth", photos.name)
-    return _scene(path, file, frames, notes, reading)
+    notes = [f"poses: {file.name} of Record3D", *_depth_notes(path, "depth", photos.name)]
+    return _scene(path, file, frames, photos, notes, reading)
 
 
 def is_metashape(folder: Path) -> bool:
@@ -165,7 +165,7 @@ def _metashape_file(folder: Path) -> Path | None:
 def _is_metashape_xml(file: Path) -> bool:
     try:
         with regular(file).open("rb") as opened:
-            head = opened.read(4096)
+            head = opened.read(4096).replace(b"\0", b"")  # of UTF-16, too
     except OSError:
         return False
     return b"<document" in head and b"<chunk" in head
@@ -181,35 +181,31 @@ def load_metashape(path: Path, **reading: Any) -> Scene:
         raise SceneError(f"{path}: no XML file of Metashape's cameras; {_METASHAPE_CURE}")
     try:
         content = regular(file).read_bytes()
-        if len(content) > _LARGEST_XML or b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        plain = content.replace(b"\0", b"")  # UTF-16 has zeros between
+        if len(content) > _LARGEST_XML or b"<!DOCTYPE" in plain or b"<!ENTITY" in plain:
             raise ValueError("too large, or with entities")
         chunks = ElementTree.fromstring(content).findall("chunk")
         if len(chunks) != 1:
             raise ValueError(f"{len(chunks)} chunks; export one")
-        frames, total = _metashape_frames(chunks[0], _pictures(file.parent))
+        frames, total = _metashape_frames(chunks[0])
     except OSError as error:
         raise SceneError(f"{file}: cannot be read ({error.strerror}); {_METASHAPE_CURE}") from None
     except (ValueError, ElementTree.ParseError) as error:
         raise SceneError(f"{file}: not cameras of Metashape ({short(error)}); {_METASHAPE_CURE}") from None
     if not frames:
-        raise SceneError(f"{file}: none of its {total} cameras has a pose and a photo; put photos beside it")
-    notes = [f"{file.name} of Metashape: {len(frames)} of {total} cameras have a pose and a photo"]
-    return _scene(file.parent, file, frames, notes, reading)
+        raise SceneError(f"{file}: none of its {total} cameras has a pose; align the photos in Metashape")
+    notes = [f"poses: {short(file.name)} of Metashape; {len(frames)} of {total} cameras have one"]
+    return _scene(file.parent, file, frames, file.parent, notes, reading)
 
 
-def _metashape_frames(
-    chunk: ElementTree.Element, by_stem: dict[str, Path]
-) -> tuple[list[dict[str, Any]], int]:
-    """The frames of the aligned cameras whose photos are there, and the number of all cameras."""
+def _metashape_frames(chunk: ElementTree.Element) -> tuple[list[dict[str, Any]], int]:
+    """The frames of the aligned cameras, and the number of all cameras."""
     lenses = {sensor.get("id"): _metashape_lens(sensor) for sensor in chunk.iterfind("sensors//sensor")}
     parts = {one.get("id"): one.find("transform") for one in chunk.iterfind("components//component")}
     frames, cameras = [], list(chunk.iterfind("cameras//camera"))
     for camera in cameras:
         placed, label = camera.findtext("transform"), (camera.get("label") or "").strip()
-        if placed is None or camera.get("enabled", "true").lower() in ("false", "0"):
-            continue
-        photo = by_stem.get(label.lower()) or by_stem.get(Path(label.replace("\\", "/")).stem.lower())
-        if photo is None:
+        if placed is None or not label or camera.get("enabled", "true").lower() in ("false", "0"):
             continue
         lens = lenses.get(camera.get("sensor_id"))
         if lens is None:
@@ -218,7 +214,7 @@ def _metashape_frames(
         part = parts.get(camera.get("component_id"))
         c2w = _to_world(part if part is not None else chunk.find("transform")) @ c2w
         c2w[:3, :3] /= np.cbrt(max(np.linalg.det(c2w[:3, :3]), 1e-30))  # positions keep the scale
-        frames.append({"file_path": photo, "transform_matrix": (c2w @ _OPENGL).tolist(), **lens})
+        frames.append({"file_path": label, "transform_matrix": (c2w @ _OPENGL).tolist(), **lens})
     return frames, len(cameras)
 
 
@@ -295,18 +291,6 @@ def _floats(text: str, count: int) -> Float64[np.ndarray, " n"]:
     return values
 
 
-def _pictures(folder: Path) -> dict[str, Path]:
-    """The pictures below a folder by name and by stem, in lower case; those of more than one are left out."""
-    found: dict[str, Path | None] = {}
-    for path in sorted(folder.rglob("*")):
-        below = path.relative_to(folder).parts
-        if path.suffix.lower() not in _PICTURES or below[0] in (*FOLDERS, "depth", "confidence"):
-            continue
-        for name in dict.fromkeys((path.name.lower(), path.stem.lower())):
-            found[name] = None if name in found else path
-    return {name: path for name, path in found.items() if path is not None}
-
-
 def _number(file: Path) -> tuple[int, str]:
     return int(file.stem) if file.stem.isdecimal() and len(file.stem) < 19 else 0, file.stem
 
@@ -322,13 +306,12 @@ def _depth_notes(folder: Path, *names: str) -> Iterator[str]:
 
 
 def _scene(
-    path: Path, file: Path, frames: list[dict[str, Any]], notes: list[str], reading: dict[str, Any]
-) -> Scene:
-    """The scene of frames whose photos are named relative to the folder of `file`."""
+    path: Path, file: Path, frames: list[dict[str, Any]], photos: Path, notes: list[str],
+    reading: dict[str, Any],
+) -> Scene:  # fmt: skip
+    """The scene of frames, named as `file` names them, whose photos are in a folder."""
     if not frames:
-        raise SceneError(f"{file}: no camera with a photo; put the photos back where the app wrote them")
-    for frame in frames:
-        if isinstance(frame["file_path"], Path):
-            frame["file_path"] = frame["file_path"].relative_to(file.parent).as_posix()
+        raise SceneError(f"{file}: no camera; export it again")
+    reading = {**reading, "images": reading.get("images") or photos}
     scene = load_transforms(file, content={"frames": frames}, **reading)
     return replace(scene, name=repaired(path.resolve().name), path=path, notes=(*notes, *scene.notes))

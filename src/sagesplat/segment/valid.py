@@ -168,7 +168,8 @@ class _Given:
     def _line(self, scene: Scene) -> str:
         """Turn masks that are inverted by all that points tell; what was found, in words."""
         first = next(iter(self.found.values()))
-        count = f"masks of {len(self.found)} of {len(scene.views)} photos, such as {first.path}"
+        photos = {view.photo_name: view.name in self.found for view in scene.views}  # not faces of cubes
+        count = f"masks of {sum(photos.values())} of {len(photos)} photos, such as {first.path}"
         if any(mask.inverted for mask in self.found.values()):
             return f"{count}: white pixels do not count, as their names say"
         if self._hide_all_points(scene):

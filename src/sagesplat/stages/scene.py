@@ -151,6 +151,8 @@ def _unread_poses(path: Path) -> str:
         return f"{folders[0]}: poses of a folder that was not given (to use them, give {path.parent})"
     folders = [folder for folder in (path, path.parent)[: 1 + beside] if folder.is_dir()]
     for file in (file for folder in folders for file in sorted(folder.iterdir())):
+        if file.name.lower().startswith("transforms") and file.suffix.lower() == ".json":
+            return f"{file}: poses of a file that was not given (to use them, give it)"
         if file.name.lower().endswith(_POSES_OF_OTHERS):
             cure = "to keep them, export a COLMAP model or a transforms.json"
             return f"{file}: poses of a format that is not read ({cure})"
