@@ -106,7 +106,7 @@ def test_other_files_are_refused_in_one_line(tmp_path):
     (tmp_path / "b.json").write_text('{"camera_model": "PINHOLE"}')
     refused(tmp_path / "b.json", "no splat format")
     (tmp_path / "c.sog").write_bytes(b"PK\x03\x04 and so on")
-    refused(tmp_path / "c.sog", "not a SOG scene")
+    refused(tmp_path / "c.sog", "a damaged archive")
     (tmp_path / "d.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
     )
