@@ -14,7 +14,7 @@ from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 
 # Axes in a file, left or right, up or down, front or back: SPZ's own are rub; COLMAP's and PLY's are rdf.
 Frame = Literal["rub", "ldb", "rdb", "lub", "ldf", "rdf", "luf", "ruf"]
-_SOME = 2**16  # Gaussians that say how far from the origin all are
+SOME = 2**16  # Gaussians that say how far from the origin all are
 OPAQUE = 16.0  # logit of opacities that a file has as infinite; its sigmoid is 1 - 1e-7
 
 
@@ -108,7 +108,7 @@ def near_origin(splat: Splat) -> Splat:
     A reader of doubles has subtracted one already, before they became float32.
     """
     means = splat.gaussians.means.numpy()
-    offset = offset_of(means[:: len(means) // _SOME + 1])
+    offset = offset_of(means[:: len(means) // SOME + 1])
     if any(splat.offset) or not any(offset):
         return splat
     return relative_to(splat, offset)
