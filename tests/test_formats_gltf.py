@@ -53,7 +53,7 @@ def test_where_nodes_put_them(tmp_path):
 
 
 def test_turned_splats_have_turned_colours():
-    g = random_gaussians(5, degree=0, seed=3)
+    g = random_gaussians(5, seed=3)
     axis, angle = np.array([2, -1, 3]) / 14**0.5, 0.7
     cross = np.cross(np.eye(3), -axis)
     rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
