@@ -242,6 +242,16 @@ def test_a_far_splat_is_adopted_and_exported(tmp_path):
         export_scene(job, tmp_path / "wide.spz", level=2, labels=(), target=None, doubles=True)
 
 
+def test_positions_that_float32_has_rounded_are_said(tmp_path):
+    g = _ball()
+    far = replace(g, means=(g.means.double() + torch.from_numpy(UTM)).float())
+    write_ply(tmp_path / "far.ply", far)
+    (note,) = read_splat(tmp_path / "far.ply").notes
+    assert "rounds them to 0.5, more than the size of most Gaussians" in note
+    write_ply(tmp_path / "large.ply", replace(far, log_scales=torch.full_like(g.log_scales, 2.0)))
+    assert not read_splat(tmp_path / "large.ply").notes
+
+
 def test_spz_refuses_steps_that_are_larger_than_gaussians(tmp_path):
     g = _ball()
     g.means[0] = 1e6

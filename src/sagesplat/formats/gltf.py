@@ -23,7 +23,7 @@ import torch
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.core.geometry import Position, offset_of
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.sh import C0
 from sagesplat.core.transform import placed, transformed
 from sagesplat.formats.labels import labelled
@@ -165,7 +165,8 @@ def _joined(parts: list[tuple[Gaussians, np.ndarray]]) -> tuple[Gaussians, Posit
     """All Gaussians where their matrices put them, less an offset that float32 would round too much."""
     step = sum(len(g) for g, _ in parts) // SOME + 1
     some = [g.means[::step].double().numpy() @ matrix[:3, :3].T + matrix[:3, 3] for g, matrix in parts]
-    offset = offset_of(np.concatenate(some))
+    moved = any(matrix[:3, 3].any() for _, matrix in parts)  # else float32 has rounded already
+    offset = offset_of(np.concatenate(some)) if moved else NO_OFFSET
     for _, matrix in parts:
         matrix[:3, 3] -= offset
     made = [placed(g, matrix) for g, matrix in parts]

@@ -225,9 +225,9 @@ def vertical_axis(comments: Iterable[str]) -> str:
 
     Its exports are of a world whose z is up. Others, such as Brush, write `Vertical axis: y` for either sign.
     """
-    words = [comment.lower() for comment in comments]
+    words = ["".join(comment.lower().split()) for comment in comments]
     written = any("nerfstudio" in word or "nerstudio" in word for word in words)  # it misspells itself
-    return "z" if written and "vertical axis: z" in words else "auto"
+    return "z" if written and "verticalaxis:z" in words else "auto"
 
 
 def _names(comments: Iterable[str], word: str) -> dict[int, str]:
