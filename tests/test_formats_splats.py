@@ -148,6 +148,20 @@ def test_a_compressed_ply_by_hand(tmp_path):
     close(g.shN[row].T.flatten(), expected)
 
 
+def test_other_elements_of_a_compressed_ply(tmp_path):
+    sound = compressed_ply(300, 3)
+    (tmp_path / "a.ply").write_bytes(sound)
+    head, body = sound.split(b"end_header\n", 1)
+    lists = b"".join(struct.pack("<B3i", 3, 0, 1, 2) for _ in range(5))
+    face, first = b"element face 5\nproperty list uchar int vertex_indices\n", head.index(b"element")
+    before = head[:first] + face + head[first:] + b"end_header\n" + lists + body
+    for content in (before, head + face + b"end_header\n" + body + lists):
+        (tmp_path / "b.ply").write_bytes(content)
+        assert same(read_splat(tmp_path / "b.ply").gaussians, read_splat(tmp_path / "a.ply").gaussians)
+    (tmp_path / "b.ply").write_bytes(before[:-1])
+    refused(tmp_path / "b.ply", "truncated")
+
+
 def test_a_compressed_ply_that_does_not_fit_together(tmp_path):
     sound = compressed_ply(300, 3)
     for old, new, message in (
