@@ -66,6 +66,11 @@ class _Asset:
     parents: dict[int, str] = field(default_factory=dict)
     antialiased: list[bool] = field(default_factory=list)  # of primitives that say it
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all buffers, each counted once."""
+        return sum({id(buffer): len(buffer) for buffer in self.buffers if buffer}.values())
+
     def view(self, index: int) -> tuple[bytes, int, int, int]:
         """Buffer, first byte, size and stride (0: none) of a buffer view; ValueError if it is none."""
         view = _entry(self.json["bufferViews"], index)
@@ -94,9 +99,7 @@ class _Asset:
         )
         if "bufferView" in accessor:
             values = self._rows(accessor, count, dtype, width)
-        elif (
-            sparse and type(count) is int and 0 <= count <= sum(len(buffer or b"") for buffer in self.buffers)
-        ):
+        elif sparse and type(count) is int and 0 <= 12 * count <= self.nbytes:  # as positions take
             values = np.zeros((count, width), dtype)
         else:
             raise ValueError("an accessor without a buffer view: compressed by an extension?")
@@ -137,7 +140,7 @@ def read_gltf(path: Path) -> Splat:
             raise DataError(
                 f"{path}: requires {', '.join(map(short, unknown[:5]))}, not supported; export it without"
             )
-        parts, left = [], sum({id(buffer): len(buffer) for buffer in asset.buffers if buffer}.values())
+        parts, left = [], asset.nbytes
         for mesh, matrix in _meshes(asset.json):
             for nbytes, part in _primitives(asset, mesh):
                 left -= nbytes
