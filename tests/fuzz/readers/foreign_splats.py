@@ -226,7 +226,8 @@ def _archives(folder: Path, size: int) -> list[bytes]:
     files = sorted(put_sog(folder / "0_0", *sog(6, 0)).parent.iterdir())
     level = {f"0_0/{path.name}": path.read_bytes() for path in files}
     description = json.dumps(streamed()).replace("1_0/", "0_0/").encode()
-    return [packed({"x/a.ply": ply}), packed(level | {"lod-meta.json": description})]
+    points = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+    return [packed({"x/a.ply": ply, "points.ply": points}), packed(level | {"lod-meta.json": description})]
 
 
 def _sogs(folder: Path, size: int) -> list[bytes]:
