@@ -242,6 +242,32 @@ def test_a_far_splat_is_adopted_and_exported(tmp_path):
         export_scene(job, tmp_path / "wide.spz", level=2, labels=(), target=None, doubles=True)
 
 
+@pytest.mark.parametrize("lossless", [False, True])
+def test_what_spz_cannot_hold_is_said(tmp_path, lossless):
+    """Its harmonics end at 1: the last level is then far from what came in, unless it is lossless."""
+    g = replace(_ball(), shN=torch.full((len(_ball()), 3, 3), 8.0))
+    write_ply(tmp_path / "a.ply", g)
+    config = AdoptConfig(
+        fit="none", views=6, size=(32, 24), shares=(0.5, 1.0), kind="object", lossless=lossless
+    )
+    events: list[Event] = []
+    job = Job(RunDir(tmp_path / "run"), events.append, "cpu")
+    open_splat(job, tmp_path / "a.ply", config, SceneConfig(), MasksConfig(), LabelsConfig())
+    make_levels(job, config)
+    said = [event.text for event in events if isinstance(event, Warned)]
+    assert any("--lossless keeps it as it came in" in text for text in said) != lossless
+
+
+def test_positions_that_float32_has_rounded_are_said(tmp_path):
+    g = _ball()
+    far = replace(g, means=(g.means.double() + torch.from_numpy(UTM)).float())
+    write_ply(tmp_path / "far.ply", far)
+    (note,) = read_splat(tmp_path / "far.ply").notes
+    assert "rounds them to 0.5, more than the size of most Gaussians" in note
+    write_ply(tmp_path / "large.ply", replace(far, log_scales=torch.full_like(g.log_scales, 2.0)))
+    assert not read_splat(tmp_path / "large.ply").notes
+
+
 def test_spz_refuses_steps_that_are_larger_than_gaussians(tmp_path):
     g = _ball()
     g.means[0] = 1e6

@@ -13,7 +13,7 @@ from sagesplat.core.errors import DataError
 from sagesplat.formats import archive
 from sagesplat.formats.labels import sidecar
 from sagesplat.formats.ply import write_ply
-from sagesplat.formats.splats import num_lods, read_splat
+from sagesplat.formats.splats import num_lods, read_splat, write_splat
 from tests.fuzz.readers.foreign_splats import archived, gltf, put_sog, sog, streamed
 from tests.test_formats_ply import make, same
 
@@ -67,6 +67,20 @@ def test_one_splat_in_an_archive(tmp_path):
     assert len(read_splat(zipped(tmp_path / "d.zip", parts)).gaussians) == 7
 
 
+def test_what_lies_beside_a_splat_in_an_archive(tmp_path):
+    """Its offset counts; points of its capture are no second splat."""
+    g = make(30, 0)
+    write_splat(tmp_path / "a.ply", g, offset=(412346.0, 5312346.0, 188.0))
+    inside = {f"x/{path.name}": path.read_bytes() for path in tmp_path.iterdir()}
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    points = {"input.ply": f"{header}end_header\n1 2 3\n".encode()}
+    splat = read_splat(zipped(tmp_path / "a.zip", inside | points))
+    assert splat.offset == (412346.0, 5312346.0, 188.0)
+    assert torch.equal(splat.gaussians.means, g.means)
+    with pytest.raises(DataError, match=r"b\.zip: input\.ply: \d+ splat properties missing"):
+        read_splat(zipped(tmp_path / "b.zip", points))
+
+
 def test_archives_that_are_refused(tmp_path, monkeypatch):
     write_ply(tmp_path / "a.ply", make(30, 0))
     content = (tmp_path / "a.ply").read_bytes()
@@ -87,7 +101,7 @@ def test_archives_that_are_refused(tmp_path, monkeypatch):
         read_splat(zipped(tmp_path / "bomb.zip", {"a.ply": content + bytes(10**6)}))
     path = zipped(tmp_path / "a.zip", {"a.ply": content})
     path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(DataError, match="not a SOG scene"):
+    with pytest.raises(DataError, match=r"a\.zip: a damaged archive .*; copy it again"):
         read_splat(path)
 
 

@@ -146,6 +146,40 @@ def test_a_mesh_in_several_nodes(tmp_path):
     assert sorted(read.means.tolist()) == sorted(expected.tolist())
 
 
+@pytest.mark.parametrize("based", [True, False])
+def test_sparse_accessors(tmp_path, based):
+    g = random_gaussians(5, degree=0, seed=3)
+    document, content = gltf(g)
+    document["bufferViews"] += [
+        {"buffer": 0, "byteOffset": len(content) + at, "byteLength": n} for at, n in ((0, 4), (4, 8))
+    ]
+    content += np.array([1, 4], "<u2").tobytes() + np.array([0.25, 0.75], "<f4").tobytes()
+    opacities = document["accessors"][3]
+    opacities["sparse"] = {
+        "count": 2, "indices": {"bufferView": 5, "componentType": 5123}, "values": {"bufferView": 6},
+    }  # fmt: skip
+    if not based:  # then the others are zeros: these Gaussians are not drawn
+        del opacities["bufferView"]
+    splat = read_splat(put(tmp_path / "a.glb", document, content))
+    expected = g.logit_opacities.sigmoid()
+    expected[[1, 4]] = torch.tensor([0.25, 0.75])
+    expected = expected if based else expected[[1, 4]]
+    torch.testing.assert_close(splat.gaussians.logit_opacities.sigmoid(), expected)
+    opacities["sparse"]["indices"]["componentType"] = 5126
+    with pytest.raises(DataError, match="not a glTF with splats that is read"):
+        read_splat(put(tmp_path / "a.glb", document, content))
+
+
+def test_a_far_node_is_an_offset(tmp_path):
+    """Translations such as those in UTM are in doubles; float32 positions would be rounded to 0.5."""
+    g = random_gaussians(50, degree=1, seed=4)
+    near = read_splat(put(tmp_path / "near.glb", *gltf(g)))
+    far = read_splat(put(tmp_path / "far.glb", *gltf(g, translation=[412346.1, 188.2, -5312345.3])))
+    assert np.abs(np.subtract(far.offset, [-412346.1, -188.2, -5312345.3])).max() < 5
+    by = torch.from_numpy(np.subtract([-412346.1, -188.2, -5312345.3], far.offset))
+    torch.testing.assert_close(far.gaussians.means.double(), near.gaussians.means + by, atol=1e-5, rtol=0)
+
+
 def test_only_the_first_buffer_is_the_binary_chunk(tmp_path):
     document, content = gltf(random_gaussians(9, degree=0))
     for view in document["bufferViews"]:
@@ -310,7 +344,7 @@ def change(document: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
         ("nodes.0.children", [0], "in its tree twice"),
         ("nodes.0.translation", [10**400, 0, 0], "OverflowError"),
         ("accessors.0.count", 10**9, "1000000000 values, more than fit"),
-        ("accessors.1.sparse", {}, "sparse"),
+        ("accessors.1.sparse", {"count": 1}, "KeyError"),
         ("accessors.2.count", 3, "3 values of KHR_gaussian_splatting:SCALE for 4 positions"),
         ("bufferViews.0.byteStride", 1, "more than fit"),
         ("buffers", [{"uri": "../b.bin"}], "is not in its folder"),

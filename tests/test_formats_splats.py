@@ -106,7 +106,7 @@ def test_other_files_are_refused_in_one_line(tmp_path):
     (tmp_path / "b.json").write_text('{"camera_model": "PINHOLE"}')
     refused(tmp_path / "b.json", "no splat format")
     (tmp_path / "c.sog").write_bytes(b"PK\x03\x04 and so on")
-    refused(tmp_path / "c.sog", "not a SOG scene")
+    refused(tmp_path / "c.sog", "a damaged archive")
     (tmp_path / "d.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
     )
@@ -146,6 +146,20 @@ def test_a_compressed_ply_by_hand(tmp_path):
     sh = body[144 + 16 * 258 + 9 * row :][:9]
     expected = [(0 if byte == 0 else 1 if byte == 255 else (byte + 0.5) / 256) * 8 - 4 for byte in sh]
     close(g.shN[row].T.flatten(), expected)
+
+
+def test_other_elements_of_a_compressed_ply(tmp_path):
+    sound = compressed_ply(300, 3)
+    (tmp_path / "a.ply").write_bytes(sound)
+    head, body = sound.split(b"end_header\n", 1)
+    lists = b"".join(struct.pack("<B3i", 3, 0, 1, 2) for _ in range(5))
+    face, first = b"element face 5\nproperty list uchar int vertex_indices\n", head.index(b"element")
+    before = head[:first] + face + head[first:] + b"end_header\n" + lists + body
+    for content in (before, head + face + b"end_header\n" + body + lists):
+        (tmp_path / "b.ply").write_bytes(content)
+        assert same(read_splat(tmp_path / "b.ply").gaussians, read_splat(tmp_path / "a.ply").gaussians)
+    (tmp_path / "b.ply").write_bytes(before[:-1])
+    refused(tmp_path / "b.ply", "truncated")
 
 
 def test_a_compressed_ply_that_does_not_fit_together(tmp_path):

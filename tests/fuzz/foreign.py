@@ -45,6 +45,7 @@ EXCEPTIONS: dict[str, str] = {
     "formats.sog_write:write_sog": _WROTE,
     "formats.stream:encode_stream": _WROTE,
     "formats.levels:select_level": "columns of a level that read_level has read",
+    "formats.offsets:write_doubles": _WROTE,
     "formats.ply:select_ply": "rows of a PLY that read_ply_splat has read",
     "io.lock:_exclusive": _HASHED,
     "io.lock:_open": _HASHED,

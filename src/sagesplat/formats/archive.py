@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from sagesplat.core.errors import DataError, short
 from sagesplat.formats.labels import sidecar
 from sagesplat.formats.lod_meta import LOD_META
+from sagesplat.formats.offsets import beside as offset_beside
 from sagesplat.formats.sog import META
 from sagesplat.io.files import loads_json
 
@@ -20,7 +21,8 @@ _DESCRIPTIONS = (LOD_META, META)  # of splats in several files
 _MOST = 100_000  # members
 _EXPANDS, _FREE = 64, 2**26  # times its size, and bytes, that an archive may unpack to
 _PIECE = 2**20  # bytes
-_DESCRIBES = 2**24  # bytes of a meta.json that is looked at
+_DESCRIBES, _HEADER = 2**24, 2**16  # bytes of a meta.json, and of a PLY's header, that are looked at
+_OF_SPLATS = (b"scale_0", b"packed_position")  # properties that PLY of points do not have
 
 
 @contextmanager
@@ -47,17 +49,19 @@ def unpacked(path: Path) -> Iterator[Path]:
 
 
 def _names(path: Path) -> list[str]:
-    """The name of the splat in an archive; none if it is damaged, which its reader says."""
+    """The name of the splat in an archive, in a list."""
     try:
         with zipfile.ZipFile(path) as archive:
             inside = [info.filename for info in archive.infolist() if _counts(info)]
             if len(inside) > _MOST:
                 raise DataError(f"{path}: {len(inside):,} files in it; unpack it, and give the splat")
             found = _splats(archive, inside)
+            if len(found) > 1:
+                found = [name for name in found if not _is_points(archive, name)] or found
     except DataError:
         raise
-    except Exception:  # zipfile and zlib raise errors of many kinds for damaged files
-        return []
+    except Exception as error:  # zipfile and zlib raise errors of many kinds for damaged files
+        raise DataError(f"{path}: a damaged archive ({short(error)}); copy it again") from None
     if not found:
         raise DataError(f"{path}: an archive without a splat in it; give a splat file")
     if len(found) > 1:
@@ -94,17 +98,26 @@ def _is_sog(archive: zipfile.ZipFile, name: str) -> bool:
     return isinstance(document, dict) and "means" in document
 
 
+def _is_points(archive: zipfile.ZipFile, name: str) -> bool:
+    """Whether a PLY is not of Gaussians, such as the points of a capture that lies beside its splat."""
+    if not name.lower().endswith(".ply"):
+        return False
+    with archive.open(name) as file:
+        head, ended, _ = file.read(_HEADER).partition(b"end_header")
+    return bool(ended) and head.startswith(b"ply") and not any(word in head for word in _OF_SPLATS)
+
+
 def _extract(path: Path, name: str, folder: Path) -> Path:
     """Unpack a splat and what belongs to it; the path of what was unpacked."""
     left = max(_FREE, _EXPANDS * path.stat().st_size)
     above = PurePosixPath(name).parent
     whole = PurePosixPath(name).name in _DESCRIPTIONS or name.lower().endswith(".gltf")
-    beside = sidecar(Path(name)).as_posix()
+    wanted = {name, sidecar(Path(name)).as_posix(), offset_beside(Path(name)).as_posix()}
     try:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
                 inside = PurePosixPath(info.filename).is_relative_to(above) if whole else False
-                if not _counts(info) or not (inside or info.filename in (name, beside)):
+                if not _counts(info) or not (inside or info.filename in wanted):
                     continue
                 target = folder / info.filename
                 target.parent.mkdir(parents=True, exist_ok=True)

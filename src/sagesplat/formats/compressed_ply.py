@@ -28,7 +28,7 @@ from sagesplat.formats.quantisation import OTHERS, largest_restored, logits_of_b
 from sagesplat.formats.sog_write import sog_order
 from sagesplat.formats.splat import Splat, SplatReader, SplatWriter, check_writable
 from sagesplat.io.files import atomic_path
-from sagesplat.io.ply_header import Element, read_elements
+from sagesplat.io.ply_header import Element, read_elements, skip
 
 _CHUNK = 256  # Gaussians
 _BLOCK = 256 * _CHUNK  # Gaussians that are decoded at a time
@@ -68,7 +68,7 @@ def _tables(path: Path, file: BinaryIO, order: str, elements: list[Element]) -> 
     """The rows of the elements chunk, vertex and sh, after checking that all of them are there."""
     named = {element.name: element for element in elements}
     chunk, vertex, sh = (named.get(name, Element(name, 0, {})) for name in ("chunk", "vertex", "sh"))
-    if any(element.lists for element in elements):
+    if chunk.lists or vertex.lists or sh.lists:
         raise DataError(f"{path}: a compressed PLY with lists is not supported; compress the scene again")
     bases = len(sh.types) // 3
     wanted = [*_ranges("", "xyz"), *_ranges("scale_", "xyz")]
@@ -83,15 +83,17 @@ def _tables(path: Path, file: BinaryIO, order: str, elements: list[Element]) -> 
         raise DataError(
             f"{path}: {chunk.count} chunks for {vertex.count} Gaussians; compress the scene again"
         )
-    sizes = [element.count * element.dtype(order).itemsize for element in elements]
-    if sum(sizes) > path.stat().st_size - file.tell():
-        raise DataError(f"{path}: {vertex.count} Gaussians announced; the file is truncated, copy it again")
-    rows = {}
+    rows, waiting = {}, [one.name for one in elements if one.name in ("chunk", "vertex", "sh")]
     for element in elements:
-        if element.name in ("chunk", "vertex", "sh"):
-            rows[element.name] = np.fromfile(file, element.dtype(order), element.count)
-        else:
-            file.seek(element.count * element.dtype(order).itemsize, 1)
+        if element.name not in waiting:
+            if len(rows) < len(waiting):
+                skip(file, order, element)
+            continue
+        if element.count * element.dtype(order).itemsize > path.stat().st_size - file.tell():
+            raise DataError(
+                f"{path}: {vertex.count} Gaussians announced; the file is truncated, copy it again"
+            )
+        rows[element.name] = np.fromfile(file, element.dtype(order), element.count)
     return rows
 
 

@@ -23,10 +23,11 @@ import torch
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.sh import C0
 from sagesplat.core.transform import placed, transformed
 from sagesplat.formats.labels import labelled
-from sagesplat.formats.splat import Splat, SplatReader
+from sagesplat.formats.splat import SOME, Splat, SplatReader
 from sagesplat.formats.spz import decode_spz
 from sagesplat.io.files import loads_json, regular
 
@@ -44,6 +45,7 @@ _COLOURS = (COLOURS, "BT.709", "BT.709-sRGB")  # the latter are of drafts
 _DRAFTS = {"ROTATION": "_ROTATION", "SCALE": "_SCALE"}
 _CURE = "export it again"
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}  # of sparse accessors
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _NODES = 10_000
 _MOST_LOG = 50.0  # of a scale: e^50 is none
@@ -64,6 +66,11 @@ class _Asset:
     parents: dict[int, str] = field(default_factory=dict)
     antialiased: list[bool] = field(default_factory=list)  # of primitives that say it
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all buffers, each counted once."""
+        return sum({id(buffer): len(buffer) for buffer in self.buffers if buffer}.values())
+
     def view(self, index: int) -> tuple[bytes, int, int, int]:
         """Buffer, first byte, size and stride (0: none) of a buffer view; ValueError if it is none."""
         view = _entry(self.json["bufferViews"], index)
@@ -82,24 +89,41 @@ class _Asset:
         `unit`: integers stand for numbers up to 1, whether the accessor says so or not.
         """
         accessor = _entry(self.json["accessors"], index)
-        count, offset, kind = accessor["count"], accessor.get("byteOffset", 0), accessor["type"]
-        if "sparse" in accessor or kind not in kinds:
-            raise ValueError(f"{kind!r:.20} in place of {' or '.join(kinds)}, or a sparse accessor")
+        count, kind = accessor["count"], accessor["type"]
+        if kind not in kinds:
+            raise ValueError(f"{kind!r:.20} in place of {' or '.join(kinds)}")
+        dtype, width, sparse = (
+            np.dtype(_TYPES[accessor["componentType"]]),
+            _WIDTHS[kind],
+            accessor.get("sparse"),
+        )
+        if "bufferView" in accessor:
+            values = self._rows(accessor, count, dtype, width)
+        elif sparse and type(count) is int and 0 <= 12 * count <= self.nbytes:  # as positions take
+            values = np.zeros((count, width), dtype)
+        else:
+            raise ValueError("an accessor without a buffer view: compressed by an extension?")
+        if sparse:
+            number, indices = sparse["count"], sparse["indices"]
+            rows = self._rows(indices, number, np.dtype(_INDICES[indices["componentType"]]), 1)[:, 0]
+            values = values.copy()
+            values[rows] = self._rows(sparse["values"], number, dtype, width)
+        if dtype.kind == "f" or not (unit or accessor.get("normalized", False)):
+            return values.astype(np.float32)
+        return (values / np.float32(np.iinfo(dtype).max)).clip(-1, 1)  # type: ignore
+
+    def _rows(self, part: dict[str, Any], count: int, dtype: np.dtype, width: int) -> np.ndarray:
+        """The values [count, width] of the buffer view that an accessor, or a part of it, names."""
+        offset = part.get("byteOffset", 0)
         if not all(type(n) is int and n >= 0 for n in (count, offset)):
             raise ValueError(f"{count!r:.20} values")
-        if "bufferView" not in accessor:
-            raise ValueError("an accessor without a buffer view: compressed by an extension?")
-        dtype, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[kind]
-        content, start, size, stride = self.view(accessor["bufferView"])
+        content, start, size, stride = self.view(part["bufferView"])
         row = width * dtype.itemsize
         stride = stride or row
         if not row <= stride <= 252 or (count and offset + (count - 1) * stride + row > size):
             raise ValueError(f"{count} values, more than fit")
-        steps = (stride, dtype.itemsize)
-        values = np.ndarray((count, width), dtype, content, start + offset if count else 0, steps)
-        if dtype.kind == "f" or not (unit or accessor.get("normalized", False)):
-            return values.astype(np.float32)
-        return (values / np.float32(np.iinfo(dtype).max)).clip(-1, 1)  # type: ignore
+        at = start + offset if count else 0
+        return np.ndarray((count, width), dtype, content, at, (stride, dtype.itemsize))
 
 
 def read_gltf(path: Path) -> Splat:
@@ -116,15 +140,16 @@ def read_gltf(path: Path) -> Splat:
             raise DataError(
                 f"{path}: requires {', '.join(map(short, unknown[:5]))}, not supported; export it without"
             )
-        parts, left = [], sum({id(buffer): len(buffer) for buffer in asset.buffers if buffer}.values())
+        parts, left = [], asset.nbytes
         for mesh, matrix in _meshes(asset.json):
             for nbytes, part in _primitives(asset, mesh):
                 left -= nbytes
                 if left < 0:  # or a few bytes could be those of many splats
                     raise ValueError("primitives or instances that share their positions too often")
-                parts.append(placed(part, _turned(matrix)))
+                parts.append((part, _turned(matrix)))
         if not parts:
             raise ValueError(f"no primitives with {NAME}")
+        g, offset = _joined(parts)
     except DataError:
         raise
     except OSError as error:
@@ -133,9 +158,22 @@ def read_gltf(path: Path) -> Splat:
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, struct.error) as error:
         text = short(error) if isinstance(error, ValueError) else short(repr(error))
         raise DataError(f"{path}: not a glTF with splats that is read ({text}); {_CURE}") from None
-    g = parts[0] if len(parts) == 1 else concat(parts)
-    antialiased = any(asset.antialiased)
-    return Splat(g, "glTF", asset.names, antialiased, parents=asset.parents, notes=tuple(asset.notes))
+    return Splat(
+        g, "glTF", asset.names, any(asset.antialiased), parents=asset.parents, notes=tuple(asset.notes),
+        offset=offset,
+    )  # fmt: skip
+
+
+def _joined(parts: list[tuple[Gaussians, np.ndarray]]) -> tuple[Gaussians, Position]:
+    """All Gaussians where their matrices put them, less an offset that float32 would round too much."""
+    step = sum(len(g) for g, _ in parts) // SOME + 1
+    some = [g.means[::step].double().numpy() @ matrix[:3, :3].T + matrix[:3, 3] for g, matrix in parts]
+    moved = any(matrix[:3, 3].any() for _, matrix in parts)  # else float32 has rounded already
+    offset = offset_of(np.concatenate(some)) if moved else NO_OFFSET
+    for _, matrix in parts:
+        matrix[:3, 3] -= offset
+    made = [placed(g, matrix) for g, matrix in parts]
+    return made[0] if len(made) == 1 else concat(made), offset
 
 
 def _entry(entries: list[Any], index: Any) -> Any:

@@ -21,11 +21,10 @@ from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.names import repaired
 from sagesplat.core.sh import BASES, C0
 from sagesplat.formats.labels import sidecar, with_labels, write_labels, write_or_remove_labels
-from sagesplat.formats.splat import Splat, SplatReader, SplatWriter
+from sagesplat.formats.splat import SOME, Splat, SplatReader, SplatWriter
 from sagesplat.io.files import atomic_path
 from sagesplat.io.ply_header import PlyHeader, read_header, read_vertices
 
-_SOME = 2**16  # Gaussians that say how far from the origin doubles are
 ROWS = 4096  # Gaussians per block, so that a block fits into the processor's cache
 _DEGREE_4 = 24  # coefficients beyond the constant one; ours end with degree 3
 _FULL = {"f4": 1.0, "f8": 1.0, "u1": 255.0, "u2": 65535.0}  # largest value of a colour property, by type
@@ -226,9 +225,9 @@ def vertical_axis(comments: Iterable[str]) -> str:
 
     Its exports are of a world whose z is up. Others, such as Brush, write `Vertical axis: y` for either sign.
     """
-    words = [comment.lower() for comment in comments]
+    words = ["".join(comment.lower().split()) for comment in comments]
     written = any("nerfstudio" in word or "nerstudio" in word for word in words)  # it misspells itself
-    return "z" if written and "vertical axis: z" in words else "auto"
+    return "z" if written and "verticalaxis:z" in words else "auto"
 
 
 def _names(comments: Iterable[str], word: str) -> dict[int, str]:
@@ -388,7 +387,7 @@ def _read_body(
     count, labelled = header.count, "label" in header.types
     if not header.order:
         table = read_vertices(path, file, header)
-        offset = offset_of(np.stack([table[axis] for axis in "xyz"], axis=1)[:: count // _SOME + 1])
+        offset = offset_of(np.stack([table[axis] for axis in "xyz"], axis=1)[:: count // SOME + 1])
         for axis, by in zip("xyz", offset, strict=True):
             table[axis] = table[axis] - by
         with np.errstate(over="ignore"):
@@ -403,7 +402,7 @@ def _read_body(
     columns, labels = np.empty((len(wanted), count), np.float32), np.full(count, -1, np.int64)
     offset, start = NO_OFFSET, file.tell()
     if count and any(header.types[axis] == "f8" for axis in "xyz"):
-        some = np.memmap(file, header.dtype, "r", start, (count,))[:: count // _SOME + 1]
+        some = np.memmap(file, header.dtype, "r", start, (count,))[:: count // SOME + 1]
         offset = offset_of(np.stack([some[axis] for axis in "xyz"], axis=1))
         file.seek(start)
     by = dict(zip("xyz", offset, strict=True)) if any(offset) else {}

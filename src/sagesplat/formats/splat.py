@@ -5,16 +5,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
+from sagesplat.core.geometry import NO_OFFSET, Position, offset_of, offset_text
 
 # Axes in a file, left or right, up or down, front or back: SPZ's own are rub; COLMAP's and PLY's are rdf.
 Frame = Literal["rub", "ldb", "rdb", "lub", "ldf", "rdf", "luf", "ruf"]
-_SOME = 2**16  # Gaussians that say how far from the origin all are
+SOME = 2**16  # Gaussians that say how far from the origin all are
 OPAQUE = 16.0  # logit of opacities that a file has as infinite; its sigmoid is 1 - 1e-7
 
 
@@ -105,12 +106,21 @@ def cleaned(splat: Splat, name: str) -> Splat:
 def near_origin(splat: Splat) -> Splat:
     """The splat with an offset subtracted from its positions where it is far from its origin.
 
-    A reader of doubles has subtracted one already, before they became float32.
+    A reader of doubles has subtracted one already, before they became float32. A note says where float32 has
+    rounded the positions to more than the size of the Gaussians.
     """
     means = splat.gaussians.means.numpy()
-    offset = offset_of(means[:: len(means) // _SOME + 1])
+    offset = offset_of(means[:: len(means) // SOME + 1])
     if any(splat.offset) or not any(offset):
         return splat
+    step = float(np.spacing(np.float32(np.abs(offset).max())))
+    size = float(splat.gaussians.log_scales.median().exp())
+    if step > size:
+        note = f"positions in float32 are at {offset_text(offset)}, which rounds them to {step:.2g}, "
+        note += (
+            f"more than the size of most Gaussians ({size:.2g}); export it with doubles, or near the origin"
+        )
+        splat = replace(splat, notes=(*splat.notes, note))
     return relative_to(splat, offset)
 
 

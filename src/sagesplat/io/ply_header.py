@@ -57,11 +57,11 @@ def read_header(file: BinaryIO) -> PlyHeader:
     for number, element in enumerate(elements):
         if element.name == "vertex":
             return PlyHeader(order, element.types, element.count, comments, first=number == 0)
-        _skip(file, order, element)
+        skip(file, order, element)
     raise ValueError("its header names no format or no vertices")
 
 
-def _skip(file: BinaryIO, order: str, element: Element) -> None:
+def skip(file: BinaryIO, order: str, element: Element) -> None:
     """Go to the end of an element; ValueError where the file ends before."""
     if element.lists or not order:
         for _ in range(element.count if element.row else 0):

@@ -50,6 +50,7 @@ _WEIGH = 32  # views that importance is measured in
 _REFIT = 24  # views that colours are fitted to, and trained sets are ordered by
 _TRAINED = 0.5  # largest share that is trained
 _SMALL = 0.1  # share up to which colours take more rounds: little is left as it was, and rounds are cheap
+_ROUNDED = 35.0  # dB; from there up the last level looks like what came in
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
 
 
@@ -196,21 +197,25 @@ def _write(
     write_set(run.prefixes, sent, settings["steps"], ladder.sizes, replaces=ladder.replaces, exact=True)
     size, total = sum(chunk.nbytes for chunk in chunks), len(sent)
     top = read_prefixes(run.prefixes).load(levels)
+    decibels = _loss(job, top, before)
+    if decibels < _ROUNDED and not lossless:
+        job.emit(Warned(f"SPZ rounds the last level to {decibels:.1f} dB; --lossless keeps it as it came in"))
+    loss = "as it came in" if np.isinf(decibels) else f"PSNR {decibels:.1f} dB against what came in"
     return [
         f"{levels} levels, {num_lower} of them of merged Gaussians; "
         f"{size / 1e6:.2f} MB in {len(chunks)} files",
-        f"{total:,} Gaussians, {len(before):,} of them at the last level: {_loss(job, top, before)}",
+        f"{total:,} Gaussians, {len(before):,} of them at the last level: {loss}",
     ]
 
 
-def _loss(job: Job, top: Gaussians, before: Gaussians) -> str:
-    """How far the last level is from what came in, for people."""
+def _loss(job: Job, top: Gaussians, before: Gaussians) -> float:
+    """PSNR of the last level against what came in, dB; infinite where it is the same."""
     errors = []
     for row in spread(job.scene.train_ids.tolist(), _COMPARE):
         one, other = (_image(job, g, row) for g in (top, before))
         errors.append(float(np.square(one - other).mean()))
     error = float(np.mean(errors))
-    return "as it came in" if error == 0 else f"PSNR {-10 * np.log10(error):.1f} dB against what came in"
+    return -10 * float(np.log10(error)) if error else float("inf")
 
 
 def _ssim(job: Job, targets: Photos, g: Gaussians, rows: Sequence[int]) -> float:

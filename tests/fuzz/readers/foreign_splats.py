@@ -179,7 +179,11 @@ def _spz_4(folder: Path, size: int) -> list[bytes]:
 
 
 def _compressed(folder: Path, size: int) -> list[bytes]:
-    return [compressed_ply(3 * size, 3, seed=0 if size == 1 else -1), compressed_ply(2, colours=False)]
+    few = compressed_ply(2, colours=False)
+    face = b"element face 1\nproperty list uchar int vertex_indices\nelement chunk"
+    head, body = few.replace(b"element chunk", face).split(b"end_header\n", 1)
+    lists = head + b"end_header\n" + struct.pack("<B3i", 3, 0, 1, 1) + body
+    return [compressed_ply(3 * size, 3, seed=0 if size == 1 else -1), few, lists]
 
 
 def _named(folder: Path, size: int) -> list[bytes]:
@@ -222,7 +226,8 @@ def _archives(folder: Path, size: int) -> list[bytes]:
     files = sorted(put_sog(folder / "0_0", *sog(6, 0)).parent.iterdir())
     level = {f"0_0/{path.name}": path.read_bytes() for path in files}
     description = json.dumps(streamed()).replace("1_0/", "0_0/").encode()
-    return [packed({"x/a.ply": ply}), packed(level | {"lod-meta.json": description})]
+    points = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+    return [packed({"x/a.ply": ply, "points.ply": points}), packed(level | {"lod-meta.json": description})]
 
 
 def _sogs(folder: Path, size: int) -> list[bytes]:
@@ -265,7 +270,14 @@ def _glbs(folder: Path, size: int) -> list[bytes]:
     spz: dict[str, Any] = gltf(splats(1))[0] | {"bufferViews": [packed]}
     inside = {"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}
     spz["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"] = inside
-    return [glb(document, content), glb(*gltf(splats(2, 0), byte_opacities=True)), glb(spz, small)]
+    sparse, values = gltf(splats(4, 0), translation=[4e5, 100.5, -5e6])
+    starts = ((len(values), 2), (len(values) + 2, 8))
+    sparse["bufferViews"] += [{"buffer": 0, "byteOffset": at, "byteLength": size} for at, size in starts]
+    indices = {"bufferView": 5, "componentType": 5121}
+    sparse["accessors"][3]["sparse"] = {"count": 2, "indices": indices, "values": {"bufferView": 6}}
+    values += struct.pack("<2B2f", 0, 3, 0.5, 0.25)
+    whole = glb(*gltf(splats(2, 0), byte_opacities=True))
+    return [glb(document, content), whole, glb(spz, small), glb(sparse, values)]
 
 
 def _gltfs(folder: Path, size: int) -> list[bytes]:

@@ -118,6 +118,7 @@ def _promises(folder: Path, size: int) -> list[bytes]:
         "screens": [0.5, 2],
     }
     entry |= {"inputs": [[0.1] * 8, [0.2] * 8], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
+    entry["photos"] = [[0.1, 0.3]] * 6
     calibration = {"status": sorted(viewpoint.STATUSES)[0], "confidence": 0.95, "num_views": 20}
     calibration |= {"targets": [0.5, 0.7], "thresholds": [0.52, 0.7], "least_support": 0.2}  # type: ignore
     calibration |= {"slopes": [0.1, 0]}
