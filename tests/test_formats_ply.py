@@ -268,7 +268,7 @@ def test_degree_4_is_cut_and_colours_are_read(tmp_path):
 
 
 def test_what_is_not_read_is_named_once(tmp_path):
-    more = {f"obj_dc_{i}": np.zeros(3, np.float32) for i in range(16)}
+    more: dict[str, np.ndarray] = {f"obj_dc_{i}": np.zeros(3, np.float32) for i in range(16)}
     more |= {
         "confidence": np.ones(3, np.float32),
         "nx": np.zeros(3, np.float32),
