@@ -210,8 +210,9 @@ def _capture(folder: Path) -> dict[str, Any]:
     capture = folder / "capture"
     put_photos(capture / "images")
     (capture / "points.ply").write_bytes(points(capture, 1)[0])
-    pose = np.eye(4).tolist()
-    frames = [{"file_path": f"images/{name}", "transform_matrix": pose} for name in PHOTOS]
+    pose = np.eye(4)
+    pose[2, 3] = 5  # in front of the points, so that they are not replaced by random ones
+    frames = [{"file_path": f"images/{name}", "transform_matrix": pose.tolist()} for name in PHOTOS]
     shared = {"w": 16, "h": 12, "fl_x": 14.0, "ply_file_path": "points.ply", "frames": frames}
     (capture / "transforms.json").write_text(json.dumps(shared))
     settings: dict[str, Any] = {"downscale": 1, "test_every": 8}
