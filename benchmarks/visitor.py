@@ -46,7 +46,7 @@ SCREENS = {
     "portrait phone": Screen(390, 844, 3.0),
 }
 SECONDS = 60
-_STEPS = 10  # poses a second
+_STEPS = 2  # poses a second: software draws no more
 _WALKS = 8  # places that a walk goes through
 # the next pose; then what is drawn and promised once the page has drawn it
 _SAMPLE = """async (pose) => {
@@ -148,7 +148,8 @@ def checked(job: Job, samples: Sequence[dict[str, Any]]) -> list[dict[str, Any]]
     for number, sample in enumerate(samples):
         camera = camera_of(sample, like)
         screen = camera.focal / drawn.focal
-        smaller = _shrunk(camera, min(drawn.rule.screens[1] / screen, 1))
+        share = min(drawn.rule.screens[1] / screen, 1)
+        smaller = camera.resized(*(max(round(share * side), 1) for side in (camera.width, camera.height)))
         at = references.at(smaller)
         levels = {one["id"]: one["shown"] for one in sample["labels"] if one["shown"]}
         full = dict.fromkeys(references.labels, job.ladder.levels[-1])
@@ -169,14 +170,6 @@ def checked(job: Job, samples: Sequence[dict[str, Any]]) -> list[dict[str, Any]]
                 }
             )
     return rows
-
-
-def _shrunk(camera: Camera, by: float) -> Camera:
-    size = [max(round(by * side), 1) for side in (camera.width, camera.height)]
-    K = camera.K.copy()
-    K[0] *= size[0] / camera.width
-    K[1] *= size[1] / camera.height
-    return replace(camera, K=K, width=size[0], height=size[1])
 
 
 def _picture(job: Job, camera: Camera, levels: dict[int, int], smaller: Camera) -> np.ndarray:
@@ -224,7 +217,7 @@ def measure(run: Path, screens: Sequence[str], every: int) -> dict[str, Any]:
 def main(
     run: tyro.conf.Positional[Path],
     screens: tuple[str, ...] = tuple(SCREENS),
-    every: int = 10,
+    every: int = 4,
     write: bool = False,
 ) -> None:
     """A visit of 60 s in Chromium: every sampled frame's promises against renderings of the full model.
@@ -232,7 +225,7 @@ def main(
     Args:
         run: folder of a run with a bundle.
         screens: which of SCREENS.
-        every: of how many frames (ten a second) one is sampled.
+        every: of how many frames (two a second) one is sampled.
         write: keep the figures in benchmarks/results/cpu/visitor.json.
     """
     unknown = set(screens) - set(SCREENS)

@@ -243,7 +243,8 @@ def test_photos_of_a_large_capture_are_thinned_and_still_cover_it():
     assert len(known) == MOST_PHOTOS  # none is left out of so many
     at = where(cameras, 1.0)
     x = np.column_stack([at.position / 2.0, at.direction, np.zeros((600, 2))])
-    thinned = away_from(x, places)
-    some = away_from(x, places[:, ::8])
+    nowhere = np.zeros(600)
+    thinned = away_from(x, places, nowhere)
+    some = away_from(x, places[:, ::8], nowhere)
     assert thinned.max() < 0.5 * some.max()
-    assert (away_from(every, places) < 1e-9).all()
+    assert (away_from(every, places, nowhere[:MOST_PHOTOS]) < 1e-9).all()

@@ -108,4 +108,8 @@ def test_poses_that_are_not_read_are_named_before_others_are_estimated(tmp_path:
     (line,) = said(3)
     assert line.startswith(f"{tmp_path}/capture/transforms.json: poses of a file that was not given")
     (tmp_path / "capture/transforms.json").unlink()
-    assert said(4) == []
+    (tmp_path / "capture/cameras.xml").write_text("<document><chunk/></document>")  # Metashape's are read
+    (line,) = said(4)
+    assert line.startswith(f"{tmp_path}/capture/cameras.xml: poses of a file that was not given")
+    (tmp_path / "capture/cameras.xml").unlink()
+    assert said(5) == []

@@ -79,7 +79,7 @@ def fit_fidelity(
         Models by label id; a category that is shown in no viewpoint has none. They are not calibrated yet.
     """
     position, direction, screen = where(cameras, focal)
-    taken_at = photo_places(photos, extent)
+    places = photo_places(photos, extent)
     shown, models = sampled.shown(), {}
     for column, label in enumerate(sampled.labels):
         rows = np.flatnonzero(shown[:, column])
@@ -91,7 +91,7 @@ def fit_fidelity(
         median = float(np.median(known)) if len(known) else 0.0
         inside = np.clip(screen[rows], *screens)
         x = inputs_of(distance, position[rows], direction[rows], extent, median, inside)
-        models[label] = _fit(label, x, values, extent, median, confidence, focal, screens, taken_at)
+        models[label] = _fit(label, x, values, extent, median, confidence, focal, screens, places)
     return models
 
 
@@ -121,7 +121,7 @@ def _fit(
     near = matern32(x, x, process.lengths)
     np.fill_diagonal(near, 0)
     least = float(near.max(1).min())  # each by the others
-    scale = AT_A_PHOTO + away_from(x, photos)
+    scale = AT_A_PHOTO + away_from(x, photos, near.max(1))
     margins = np.clip(
         [
             np.quantile(critical_margins(left_out, values, target, scale), confidence, method="higher")

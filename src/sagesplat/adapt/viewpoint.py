@@ -170,7 +170,7 @@ class ViewModel:
         k = near + self.heldout_variance * self.heldout_inputs
         mean = monotone(means_at(self.curves, distance) + k @ self.weights)
         support = near.max(1)
-        away = away_from(x, self.photos) if self.photos.size else 1 - support
+        away = away_from(x, self.photos, support)
         return Prediction(mean, self.calibration.bound(mean, support, away), support, away)
 
     def inputs_at(
@@ -200,8 +200,15 @@ def where(cameras: Sequence[Camera], focal: float) -> Where:
     return Where(position, direction, np.array([camera.focal for camera in cameras], np.float64) / focal)
 
 
-def away_from(x: Float[np.ndarray, "V 8"], photos: Float[np.ndarray, "6 P"]) -> Float[np.ndarray, " V"]:
-    """How far viewpoints, given by their inputs, are from the photos: 0 at one of them, 1 far from all."""
+def away_from(
+    x: Float[np.ndarray, "V 8"], photos: Float[np.ndarray, "6 P"], support: Float[np.ndarray, " V"]
+) -> Float[np.ndarray, " V"]:
+    """How far viewpoints, given by their inputs, are from the photos: 0 at one of them, 1 far from all.
+
+    Without `photos` the known viewpoints are the photos, and it is 1 - support.
+    """
+    if not photos.size:
+        return 1 - support
     return 1 - matern32(x[:, :6], photos.T, PHOTO_LENGTHS).max(1)
 
 

@@ -28,14 +28,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float64
 from msgspec import Meta
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from sagesplat.adapt.free_poses import looking
 from sagesplat.core.errors import RunError
-from sagesplat.core.geometry import NO_OFFSET, Position
+from sagesplat.core.geometry import NO_OFFSET, Position, less_offset
 from sagesplat.core.limits import Count, Positive, Screen, Seed, Share
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.typed import check_limits, convert_as, read_json_as, refused
@@ -295,19 +294,13 @@ def read_cameras(path: Path, like: Camera, offset: Position = NO_OFFSET) -> list
     with refused(path, "a list of viewpoints", cure):
         if isinstance(document, dict) and document.get("format") == VIEWPOINTS:
             made = convert_as(document, ViewpointsFile)
-            by = np.subtract(offset, made.offset)
-            cameras = [replace(entry, w2c=_moved(entry.w2c, by)).camera() for entry in made.viewpoints]
+            x, y, z = np.subtract(offset, made.offset).tolist()
+            entries = [replace(entry, w2c=less_offset(entry.w2c, (x, y, z))) for entry in made.viewpoints]
+            cameras = [entry.camera() for entry in entries]
         else:
             frames = convert_as(document, Poses).frames
-            poses = [_moved(frame.world_to_camera(), np.array(offset)) for frame in frames]
+            poses = [less_offset(frame.world_to_camera(), offset) for frame in frames]
             cameras = [replace(like.neutral, w2c=w2c.astype(np.float32)) for w2c in poses]
         if not cameras:
             raise ValueError("no viewpoints")
     return cameras
-
-
-def _moved(w2c: Float64[np.ndarray, "4 4"], by: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, "4 4"]:
-    """A pose, world to camera, after `by` was subtracted from all positions of the world."""
-    moved = w2c.copy()
-    moved[:3, 3] += w2c[:3, :3] @ by
-    return moved

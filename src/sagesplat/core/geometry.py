@@ -39,6 +39,13 @@ def offset_of(middles: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "M 3"
     return x, y, z
 
 
+def less_offset(w2c: Float[np.ndarray, "*V 4 4"], offset: Position) -> Float[np.ndarray, "*V 4 4"]:
+    """Poses, world to camera, after `offset` was subtracted from all positions of the world."""
+    moved = w2c.copy()
+    moved[..., :3, 3] += w2c[..., :3, :3] @ np.array(offset)
+    return moved
+
+
 def offset_text(offset: Position) -> str:
     """An offset for people and files: "412346 5312346 188"."""
     return " ".join(f"{value:.10g}" for value in offset)

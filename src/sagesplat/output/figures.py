@@ -320,32 +320,27 @@ def quality_over_size(
     axes = figure.subplots()
     size = [sum(n for (_, i), n in sizes.items() if i == level) / MB for level in uniform]
     axes.plot(size, list(uniform.values()), "o-", color=FAINT, ms=4, label="all categories at one level")
-    composed = []
+    composed: list[tuple[float, float, Plan]] = []
     for plan in plans:
         rows = evaluation.of(plan).of_own_quality()
         whole = rows.ssim[rows.label_id == TOTAL]
         if len(whole) and plan.quality == quality:
-            composed.append((sum(map(bytes_of, plan.choices)) / MB, float(np.nanmean(whole)), plan.target))
-    axes.plot(*np.array(composed).reshape(-1, 3).T[:2], "o-", color=ACCENT, ms=6, label="composed by plan")
+            composed.append((sum(map(bytes_of, plan.choices)) / MB, float(np.nanmean(whole)), plan))
+    at = [x for x, _, _ in composed]
+    axes.plot(at, [y for _, y, _ in composed], "o-", color=ACCENT, ms=6, label="composed by plan")
     if drawn and composed:
         means = {label: np.nanmean(values, 0) for label, values in drawn.items() if np.isfinite(values).any()}
         levels = sorted({level for _, level in sizes})
         lowest = np.min([*means.values()], axis=0)
         axes.plot(size, lowest[[levels.index(level) for level in uniform]], "--", color=FAINT)
         planned = [
-            min(
-                mean[levels.index(plan.levels[label])]
-                for label, mean in means.items()
-                if label in plan.levels
-            )
-            for target in composed
-            for plan in plans
-            if (plan.quality, plan.target) == (quality, target[2])
+            min(means[label][levels.index(level)] for label, level in plan.levels.items() if label in means)
+            for _, _, plan in composed
         ]
-        axes.plot([x for x, _, _ in composed], planned, "--", color=ACCENT)
+        axes.plot(at, planned, "--", color=ACCENT)
         axes.plot([], [], "--", color=INK, label="the same, lowest category")
-    for x, y, target in composed:
-        axes.annotate(f"t = {target:g}", (x, y), (7, -11), textcoords="offset points", color=ACCENT)
+    for x, y, plan in composed:
+        axes.annotate(f"t = {plan.target:g}", (x, y), (7, -11), textcoords="offset points", color=ACCENT)
     of = "against the full model" if quality == "fidelity" else "against photos"
     axes.set(xlabel=unit, ylabel=f"SSIM of the whole image {of}")
     axes.margins(0.08, 0.12)

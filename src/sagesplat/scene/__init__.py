@@ -10,7 +10,7 @@ from sagesplat.core.errors import SceneError
 from sagesplat.core.geometry import offset_text
 from sagesplat.io.colour_profile import describe_profiles
 from sagesplat.scene.detect import CAPTURES, locate
-from sagesplat.scene.given_masks import GivenMasks
+from sagesplat.scene.given_masks import masks_of
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import read_scene
@@ -125,8 +125,7 @@ def describe(scene: Scene) -> list[tuple[str, str]]:
     rows += [("colours", line) for line in describe_profiles(view.image_path for view in views)]
     masks = scene.path / "masks"
     num_masks = len(list(masks.glob("**/*.png")))
-    photos = scene.views[0].image_path.parents[scene.views[0].name.count("/")]
-    given = GivenMasks([scene.path, photos.parent], photos)
+    given = masks_of(scene)
     if num_masks and masks not in given.folders:
         rows.append(("masks", f"{num_masks} label images in {masks.name}/"))
     elif not given:

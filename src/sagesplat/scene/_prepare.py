@@ -75,10 +75,8 @@ def prepare_photos(
 
 def _list(source: Path, skipped: Path) -> list[Path]:
     """Photos below a folder, without hidden ones and masks, sorted by name with numbers by value."""
-    skipped, masks = (
-        skipped.resolve(),
-        [folder for folder in mask_folders_below(source) if _holds_no_photos(folder)],
-    )
+    skipped = skipped.resolve()
+    masks = [folder for folder in mask_folders_below(source) if _holds_no_photos(folder)]
     outside = not source.resolve().is_relative_to(skipped)
     photos = []
     for path in source.rglob("*"):

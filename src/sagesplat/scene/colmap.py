@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sagesplat.core.errors import SceneError, short
-from sagesplat.core.geometry import Position, offset_of
+from sagesplat.core.geometry import Position, less_offset, offset_of
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
@@ -80,7 +80,7 @@ def _near_origin(
     offset = offset_of(centres, *([] if points is None else [points.xyz]))
     if not any(offset):
         return offset, listed, points
-    w2c[:, :3, 3] += w2c[:, :3, :3] @ offset
+    w2c = less_offset(w2c, offset)
     listed = [replace(image, w2c=moved) for image, moved in zip(listed, w2c, strict=True)]
     return offset, listed, None if points is None else points._replace(xyz=points.xyz - offset)
 

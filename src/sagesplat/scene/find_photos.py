@@ -16,9 +16,8 @@ from sagesplat.core.names import check_photo, collision_key, composed
 
 # Their content decides how they are read (`io.pictures`).
 PHOTOS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".avif", ".heic", ".heif"})
-_RAW = frozenset(
-    {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gpr"}
-)  # exported as others
+# of photos that were exported as others
+_RAW = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gpr"})
 _DEEPEST, _MOST = 8, 10**5  # folders below each other, and in all
 PHOTO_FOLDERS = ("images", "input")  # 3DGS's own scripts read photos from input/
 # Folders beside photos begin so: of smaller copies, masks, depths.

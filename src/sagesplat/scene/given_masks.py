@@ -19,6 +19,7 @@ from jaxtyping import Bool
 from sagesplat.core.names import collision_key
 from sagesplat.io.pictures import FREE_PIXELS, PHOTO_FORMATS, PictureError, open_picture
 from sagesplat.scene.images import read_black
+from sagesplat.scene.scene import Scene
 
 VALID_FOLDER = "masks_valid"  # what is in it is never taken for label images
 INVERTED_FOLDER = "masks_inverted"
@@ -80,6 +81,13 @@ class GivenMasks:
             if named and name in self._among and _is_two_valued(self._among[name]):
                 return GivenMask(self._among[name], turned)
         return None
+
+
+def masks_of(scene: Scene, folder: Path | None = None) -> GivenMasks:
+    """The masks that lie beside the photos of a scene, or in `folder`."""
+    view = scene.views[0]
+    photos = view.image_path.parents[view.photo_name.count("/")]
+    return GivenMasks([scene.path, photos.parent], photos, folder)
 
 
 def _is_below(path: Path, folders: Sequence[Path]) -> bool:

@@ -398,9 +398,8 @@ def world_to_camera(c2w: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndar
     if len(c2w) == 4 and np.abs(c2w[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise ValueError("the last row of transform_matrix is not 0 0 0 1 (is it transposed?)")
     axes = c2w[:3, :3]
-    length = np.sqrt(
-        (axes * axes).sum() / 3
-    )  # of all three: the scale of the camera's node, which turns nothing
+    # of all three: the scale of the camera's node, which turns nothing
+    length = np.sqrt((axes * axes).sum() / 3)
     axes = axes / (length if length > SMALLEST else 1)
     shear = np.abs(axes.T @ axes - np.eye(3)).max()
     if shear > MAX_SHEAR:
@@ -436,9 +435,8 @@ def _listed_split(
                 f"{file}: {len(unknown)} of {len(listed)} names in {kind}_filenames are of no frame, first "
                 f"{short(repr(unknown[0]))}; list the file_path of frames, or leave the list out"
             )
-        names[kind] = set().union(
-            *(of_frames.get(name, ()) for name in listed)
-        )  # none of a photo that is gone
+        # a photo that is gone has no view
+        names[kind] = {view for name in listed for view in of_frames.get(name, ())}
     every = {view.name for view in views}
     tests = names.get("test") or names.get("val") or every - names["train"]
     train = names.get("train") or every - tests

@@ -159,10 +159,11 @@ def is_metashape(folder: Path) -> bool:
 
 
 def _metashape_file(folder: Path) -> Path | None:
-    return next((file for file in sorted(folder.glob("*.xml")) if _is_metashape_xml(file)), None)
+    return next((file for file in sorted(folder.glob("*.xml")) if is_metashape_xml(file)), None)
 
 
-def _is_metashape_xml(file: Path) -> bool:
+def is_metashape_xml(file: Path) -> bool:
+    """Whether an XML file is of Metashape's cameras."""
     try:
         with regular(file).open("rb") as opened:
             head = opened.read(4096).replace(b"\0", b"")  # of UTF-16, too

@@ -17,7 +17,7 @@ from scipy.ndimage import minimum_filter
 
 from sagesplat.core.errors import LabelError, SceneError
 from sagesplat.io.files import atomic_path
-from sagesplat.scene.given_masks import INVERTED_FOLDER, GivenMask, GivenMasks
+from sagesplat.scene.given_masks import INVERTED_FOLDER, GivenMask, masks_of
 from sagesplat.scene.images import cut_out, has_alpha, load_alpha, read_black
 from sagesplat.scene.raw_photos import RawPhoto, raw_photos
 from sagesplat.scene.scene import Scene, View
@@ -141,7 +141,7 @@ class _Given:
     """The masks that came with the photos: in folders (`scene.given_masks`), and those that views name."""
 
     def __init__(self, scene: Scene, folder: Path | None):
-        masks = given_masks(scene, folder)
+        masks = masks_of(scene, folder)
         self.raw = raw_photos(scene.path) if masks else {}
         found = ((view.name, masks.of(view.photo_name)) for view in scene.views)
         self.found = {name: mask for name, mask in found if mask is not None}
@@ -200,13 +200,6 @@ def describe_masks(scene: Scene) -> str:
         return _Given(scene, None).line
     except (LabelError, SceneError) as error:
         return str(error)
-
-
-def given_masks(scene: Scene, folder: Path | None = None) -> GivenMasks:
-    """The masks that lie beside the photos of a scene, or in `folder`."""
-    view = scene.views[0]
-    photos = view.image_path.parents[view.photo_name.count("/")]
-    return GivenMasks([scene.path, photos.parent], photos, folder)
 
 
 def _seen(mask: GivenMask, view: View, raw: RawPhoto | None) -> Pixels:

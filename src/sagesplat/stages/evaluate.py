@@ -82,19 +82,19 @@ def _lines(plan: Plan, rows: Evaluation, exposed: bool) -> list[str]:
         f"{asked}: test views {fidelity}{at.ssim.mean():.3f} / {at.psnr.mean():.2f} dB "
         f"(full model {at.full_ssim.mean():.3f} / {at.full_psnr.mean():.2f} dB)"
         f"{', with colours fitted to their photos' if exposed else ''}",
-        _further(at),
+        *_further(at),
         *([_colours(at)] if exposed else []),
     ]
 
 
-def _further(at: Evaluation) -> str:
-    """What else was measured of the same images, of the plan and of the full model."""
+def _further(at: Evaluation) -> list[str]:
+    """What else was measured of the same images, of the plan and of the full model; no line without any."""
     told = [
-        f"{title} {getattr(at, name).mean():.3f} ({getattr(at, 'full_' + name).mean():.3f})"
+        f"{title} {tables.mean(getattr(at, name)):.3f} ({tables.mean(getattr(at, 'full_' + name)):.3f})"
         for name, title in zip(OTHERS, ("MS-SSIM", "FLIP", "LPIPS"), strict=True)
-        if not np.isnan(getattr(at, name)).all()
+        if np.isfinite(getattr(at, name)).any()
     ]
-    return f"  {', '.join(told)}"
+    return [f"  {', '.join(told)}"] if told else []
 
 
 def _colours(at: Evaluation) -> str:

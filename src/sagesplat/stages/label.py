@@ -22,7 +22,7 @@ from sagesplat.run.records import file_hash
 from sagesplat.run.remote import work_all
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
-from sagesplat.scene.given_masks import holds_masks
+from sagesplat.scene.given_masks import holds_masks, masks_of
 from sagesplat.segment.display_names import categories, title_of, titles
 from sagesplat.segment.edit import Edited, edit_labels, ignored_ids, parse_merge, parse_names
 from sagesplat.segment.lift import agreement_in, lift
@@ -30,7 +30,7 @@ from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED, Masks, Taxonomy, write_labels
 from sagesplat.segment.registry import SEGMENTERS, segmenter_for
 from sagesplat.segment.segmenters import segment_some
-from sagesplat.segment.valid import ValidPixels, given_masks, write_valid
+from sagesplat.segment.valid import ValidPixels, write_valid
 from sagesplat.stages.memory import check_network
 from sagesplat.stages.prompts import MASKS, Scores, Timed, load, prompt_lines, settings_of
 from sagesplat.stages.scene import check_not_adopted
@@ -66,7 +66,7 @@ def make_masks(job: Job, config: MasksConfig, labels: LabelsConfig = LabelsConfi
         return [*_lines(edited), *said, *_ignored_lines(ignored)]
 
     settings = {name: value for name, value in asdict(labels).items() if name != "instances"}
-    given = given_masks(job.scene, _mask_folder(config))
+    given = masks_of(job.scene, _mask_folder(config))
     if given:
         settings["valid"] = [file_hash(place) for place in given.places]
     inputs = [run.provenance("segment"), run.segmented / "labels.json"]

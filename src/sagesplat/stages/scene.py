@@ -24,6 +24,7 @@ from sagesplat.scene.feature_masks import OfPhoto
 from sagesplat.scene.find_model import model_folders
 from sagesplat.scene.find_photos import PHOTO_FOLDERS
 from sagesplat.scene.given_masks import holds_masks
+from sagesplat.scene.scans import is_metashape_xml
 from sagesplat.scene.scene import Scene, Vignetting
 from sagesplat.scene.stored import write_scene
 from sagesplat.segment.edit import ignored_ids, parse_merge, parse_names
@@ -31,8 +32,8 @@ from sagesplat.segment.mask_files import label_images_of
 from sagesplat.stages.edited import check_not_edited
 
 _CPU_PIXELS = 1.25e6  # of a photo: a training step's time and the cap of Gaussians grow with them
-# VisualSFM, Bundler, OpenSfM, OpenMVG, Meshroom, Metashape.
-_POSES_OF_OTHERS = (".nvm", "bundle.out", "reconstruction.json", "sfm_data.json", ".sfm", "cameras.xml")
+# VisualSFM, Bundler, OpenSfM, OpenMVG, Meshroom.
+_POSES_OF_OTHERS = (".nvm", "bundle.out", "reconstruction.json", "sfm_data.json", ".sfm")
 _SHARES = {1: "all", 2: "half", 4: "a quarter", 8: "an eighth"}  # of a photo's width
 
 
@@ -151,9 +152,11 @@ def _unread_poses(path: Path) -> str:
         return f"{folders[0]}: poses of a folder that was not given (to use them, give {path.parent})"
     folders = [folder for folder in (path, path.parent)[: 1 + beside] if folder.is_dir()]
     for file in (file for folder in folders for file in sorted(folder.iterdir())):
-        if file.name.lower().startswith("transforms") and file.suffix.lower() == ".json":
+        name = file.name.lower()
+        transforms = name.startswith("transforms") and name.endswith(".json")
+        if transforms or (name.endswith(".xml") and is_metashape_xml(file)):
             return f"{file}: poses of a file that was not given (to use them, give it)"
-        if file.name.lower().endswith(_POSES_OF_OTHERS):
+        if name.endswith(_POSES_OF_OTHERS):
             cure = "to keep them, export a COLMAP model or a transforms.json"
             return f"{file}: poses of a format that is not read ({cure})"
     return ""

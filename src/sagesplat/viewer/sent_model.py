@@ -62,7 +62,7 @@ class SentModel:
         curves = means_at(self.curves, distance) if self.curves else 0.0
         mean = monotone(curves + self.offsets + near @ self.weights)
         support = near.max(1)
-        away = away_from(x, self.photos) if self.photos.size else 1 - support
+        away = away_from(x, self.photos, support)
         return Prediction(mean, self.calibration.bound(mean, support, away), support, away)
 
     def corrected(
