@@ -190,28 +190,33 @@ def measure(run: Path, screens: Sequence[str], every: int) -> dict[str, Any]:
         thread = threading.Thread(target=view.run, args=(False,))
         thread.start()
         try:
-            samples = {name: sampled(view.urls[0], cameras, SCREENS[name], every) for name in screens}
+            for name in screens:
+                results[name] = _on_screen(job, name, sampled(view.urls[0], cameras, SCREENS[name], every))
         finally:
             view.stop()
             thread.join()
-    for name, found in samples.items():
-        rows = checked(job, found)
-        told = [row for row in rows if row["promised"] is not None]
-        missed = [row for row in told if row["measured"] < row["promised"]]
-        results[name] = {
-            "frames": len(found),
-            "screen": float(np.median([row["screen"] for row in rows])),
-            "decisions": len(rows),
-            "promised": len(told) / max(len(rows), 1),
-            "kept": 1 - len(missed) / max(len(told), 1),
-            "frames_with_a_miss": len({row["frame"] for row in missed}),
-            "missed": missed,
-        }
-        print(
-            f"{name}: {len(found)} frames at {results[name]['screen']:.2f} times the photos' focal length; "
-            f"promised {len(told)} of {len(rows)}, of these kept {results[name]['kept']:.3f}"
-        )
     return results
+
+
+def _on_screen(job: Job, name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The visit on one screen, and a line about it."""
+    rows = checked(job, found)
+    told = [row for row in rows if row["promised"] is not None]
+    missed = [row for row in told if row["measured"] < row["promised"]]
+    result = {
+        "frames": len(found),
+        "screen": float(np.median([row["screen"] for row in rows])),
+        "decisions": len(rows),
+        "promised": len(told) / max(len(rows), 1),
+        "kept": 1 - len(missed) / max(len(told), 1),
+        "frames_with_a_miss": len({row["frame"] for row in missed}),
+        "missed": missed,
+    }
+    print(
+        f"{name}: {len(found)} frames at {result['screen']:.2f} times the photos' focal length; "
+        f"promised {len(told)} of {len(rows)}, of these kept {result['kept']:.3f}"
+    )
+    return result
 
 
 def main(
