@@ -20,7 +20,7 @@ targets by preliminary thresholds. What is calibrated is the nominal target to a
 import math
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 AT_A_PHOTO = 0.2  # of the margin there, over what it grows by to far from all photos
 
@@ -52,37 +52,24 @@ def critical_margins(
 
 
 def critical_nominals(
-    bound: Float[np.ndarray, "n K"],
-    nominal: Float[np.ndarray, " J"],
-    taken: Int[np.ndarray, "n J"],
-    measured: Float[np.ndarray, "n J"],
-    target: float,
+    nominal: Float[np.ndarray, " J"], measured: Float[np.ndarray, "n J"], target: float
 ) -> Float[np.ndarray, " n"]:
-    """In each view, the largest nominal target by which a level is taken that misses the target.
+    """In each view, the nominal target from which on compositions keep the target.
 
     Args:
-        bound: [n, K], preliminary bounds: a nominal target takes the first level whose bound reaches it.
         nominal: [J], ascending: the targets that compositions were planned for.
-        taken: [n, J], columns of `bound` taken.
         measured: [n, J], quality in the composition.
         target: That is to be kept.
 
     Returns:
-        [n]. Levels between those of two compositions are interpolated; those below the first count as missed.
-        1 where the last composition misses: nothing but the full model is known to keep the target.
+        [n]. Between two compositions it is interpolated by what they measure; the first nominal target where
+        none misses; 1 where the last one does: nothing but the full model is known to keep the target.
     """
-    n, J = taken.shape
+    n, J = measured.shape
     missed = measured < target
     last = J - 1 - missed[:, ::-1].argmax(1)  # the last composition that misses
     rows, after = np.arange(n), np.minimum(last + 1, J - 1)
-    level, above = taken[rows, last], taken[rows, after]
     low, high = measured[rows, last], measured[rows, after]
-    part = (target - low) / np.maximum(high - low, 1e-12)
-    between = level + np.floor(np.clip(part, 0, 1) * (above - level)).astype(int)
-    between = np.where(above > level, np.minimum(between, above - 1), level)
-    # the same level in both: its neighbours' levels made the difference
-    found = np.where(above > level, bound[rows, between], nominal[after])
-    found = np.where(last == J - 1, 1.0, found)
-    first = taken[:, 0]
-    below = np.where(first > 0, bound[rows, np.maximum(first - 1, 0)], -np.inf)
-    return np.where(missed.any(1), np.maximum(found, below), below)
+    part = np.clip((target - low) / np.maximum(high - low, 1e-12), 0, 1)
+    found = nominal[last] + part * (nominal[after] - nominal[last])
+    return np.where(missed.any(1), np.where(last == J - 1, 1.0, found), nominal[0])

@@ -31,18 +31,45 @@ PROMISED_SHARE = 2e-3  # of a picture that a category has to cover: of fewer pix
 
 @dataclass(frozen=True, eq=False)
 class SampledFidelity:
-    """Fidelity of every category at every level, all categories at the same level, at drawn viewpoints."""
+    """Fidelity of every cell, or category, at every level, all at the same level, at drawn viewpoints."""
 
-    labels: tuple[int, ...]  # ids, ascending
+    labels: tuple[int, ...]  # ids of cells or categories, ascending
     fidelity: Float32[np.ndarray, "V L K"]  # NaN where the category is not in sight
     pixels: Int32[np.ndarray, "V L"]  # of the category in the full model's image
     image: Int32[np.ndarray, " V"]  # pixels of the whole image
     whole: Float32[np.ndarray, "V K"]  # over all pixels
     distance: Float32[np.ndarray, "V L"]  # d_min, world units; NaN: unknown
 
+    def by_label(self, label_of: Mapping[int, int]) -> "SampledFidelity":
+        """The same of categories, from their cells: means over pixels, and the least distance."""
+        column = {label: i for i, label in enumerate(sorted(set(label_of.values())))}
+        member = np.zeros((len(self.labels), len(column)), bool)
+        for row, cell in enumerate(self.labels):
+            member[row, column[label_of[cell]]] = True
+        far = np.where(np.isnan(self.distance), np.inf, self.distance)
+        nearest = np.where(member, far[..., None], np.inf).min(1, initial=np.inf)
+        return SampledFidelity(
+            labels=tuple(column),
+            fidelity=pooled_cells(self.fidelity.transpose(0, 2, 1), self.pixels, member).transpose(0, 2, 1),
+            pixels=(self.pixels @ member).astype(np.int32),
+            image=self.image,
+            whole=self.whole,
+            distance=np.where(np.isinf(nearest), np.nan, nearest).astype(np.float32),
+        )
+
     def shown(self) -> np.ndarray:
         """Whether a category covers at least `PROMISED_SHARE` of the image, bool [V, L]."""
         return (self.pixels > 0) & (self.pixels >= PROMISED_SHARE * self.image[:, None])
+
+
+def pooled_cells(
+    fidelity: Float32[np.ndarray, "V J C"], pixels: Int32[np.ndarray, "V C"], member: Bool[np.ndarray, "C L"]
+) -> Float32[np.ndarray, "V J L"]:
+    """Fidelity of categories from that of their cells; NaN where none of them is in sight or measured."""
+    weight = np.where(np.isnan(fidelity), 0, pixels[:, None])
+    total = weight @ member
+    value = (weight * np.nan_to_num(fidelity)) @ member
+    return np.where(total > 0, value / np.where(total > 0, total, 1), np.nan).astype(np.float32)
 
 
 def shown_enough(pixels: Int[np.ndarray, "V L"], cameras: Sequence[Camera]) -> Bool[np.ndarray, "V L"]:

@@ -2,8 +2,9 @@
 
 Three sets of drawn viewpoints are used, each for one thing:
 
-1. "fit": a Gaussian process per category learns the expected fidelity of each level, all categories at the
-   same level. Each viewpoint predicted without itself gives preliminary thresholds.
+1. "fit": a Gaussian process per cell learns the expected fidelity of each level, all cells at the same level;
+   those of a category share their length scales. Each viewpoint predicted without itself gives preliminary
+   thresholds of the categories.
 2. "bias": compositions planned by the thresholds for a range of nominal targets are measured, and the
    thresholds corrected so that they allow for neighbours at other levels (`remove_composition_bias`). Where a
    category misses a target at any level of its own, as its neighbours spill over it, all categories are held
@@ -26,18 +27,12 @@ from sagesplat.adapt.calibrate import (
     critical_nominals,
     fewest_views,
 )
+from sagesplat.adapt.cell_models import CellModel, Expected, FidelityModel, factors_of, needed
+from sagesplat.adapt.cell_plans import reach
+from sagesplat.adapt.cells import Cells, Sight, look
 from sagesplat.adapt.fidelity import SampledFidelity
-from sagesplat.adapt.process import fit_process, inputs_of, matern32
-from sagesplat.adapt.viewpoint import (
-    PHOTO_LENGTHS,
-    Calibration,
-    Status,
-    ViewModel,
-    away_from,
-    constant_curve,
-    monotone,
-    where,
-)
+from sagesplat.adapt.process import fit_together, inputs_of, matern32
+from sagesplat.adapt.viewpoint import PHOTO_LENGTHS, Calibration, Status, away_from, monotone, where
 from sagesplat.scene.scene import Camera
 
 # Targets that compositions are planned for.
@@ -52,105 +47,134 @@ NOTHING_HELD = np.zeros(len(TARGETS), bool)
 _ABOVE = 1e-9  # a threshold lies above its critical value
 _MARGINS = (-1.0, 10.0)  # limits of preliminary ones
 MOST_PHOTOS = 256  # by which it is known how far a place is from the photos
+CELL_SHARE = 5e-4  # of a picture that a cell has to cover where its model learns
+_TOWARDS = 4.0  # views that a category's mean counts as, beside those of a cell
 _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more than chance
 
 
 def fit_fidelity(
     sampled: SampledFidelity,
+    cells: Cells,
     cameras: Sequence[Camera],
     extent: float,
     confidence: float,
     focal: float,
     screens: tuple[float, float],
     photos: Sequence[Camera],
-) -> dict[int, ViewModel]:
-    """Fit the expected fidelity of each category over the viewpoint, with preliminary thresholds.
+) -> dict[int, FidelityModel]:
+    """Fit the expected fidelity of each cell over the viewpoint, with preliminary thresholds by category.
 
     Args:
-        sampled: Measured at V viewpoints that are used for nothing else.
+        sampled: Of the cells, measured at V viewpoints that are used for nothing else.
+        cells: Where they are.
         cameras: The V viewpoints.
         extent: Of the scene, world units.
         confidence: Of the preliminary thresholds.
         focal: Of the photos, pixels.
-        screens: Of the viewpoints (`ViewModel`).
+        screens: Of the viewpoints (`FidelityModel`).
         photos: At least one camera; margins grow away from them.
 
     Returns:
         Models by label id; a category that is shown in no viewpoint has none. They are not calibrated yet.
     """
     position, direction, screen = where(cameras, focal)
-    places = photo_places(photos, extent)
-    shown, models = sampled.shown(), {}
-    for column, label in enumerate(sampled.labels):
-        rows = np.flatnonzero(shown[:, column])
-        if not len(rows):
-            continue
-        values = sampled.fidelity[rows, column].astype(np.float64)
-        distance = sampled.distance[rows, column].astype(np.float64)
-        known = np.log(distance[distance > 0])
-        median = float(np.median(known)) if len(known) else 0.0
-        inside = np.clip(screen[rows], *screens)
-        x = inputs_of(distance, position[rows], direction[rows], extent, median, inside)
-        models[label] = _fit(label, x, values, extent, median, confidence, focal, screens, places)
+    inside = np.clip(screen, *screens)
+    views = inputs_of(np.ones(len(cameras)), position, direction, extent, 0.0, inside)[:, :7]
+    sight, places = look(cells, cameras), photo_places(photos, extent)
+    whole = sampled.by_label(cells.label_of)
+    models, shown = {}, whole.shown()
+    for column, label in enumerate(whole.labels):
+        if shown[:, column].any():
+            mine = np.flatnonzero(cells.labels == label)
+            part = _Part(mine, cells.ids[mine].tolist(), sampled, sight)
+            rows = np.flatnonzero(shown[:, column])
+            models[label] = _fit(
+                label, part, views, whole.fidelity[rows, column].astype(np.float64), rows, confidence,
+                places, extent, focal, screens,
+            )  # fmt: skip
     return models
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """The cells of one category at the viewpoints."""
+
+    columns: Int[np.ndarray, " c"]
+    ids: list[int]
+    sampled: SampledFidelity
+    sight: Sight
 
 
 def _fit(
     label: int,
-    x: Float[np.ndarray, "n 8"],
-    values: Float[np.ndarray, "n K"],
-    extent: float,
-    median: float,
+    part: _Part,
+    views: Float[np.ndarray, "V 7"],
+    category: Float[np.ndarray, "n K"],  # fidelity in the rows that show it
+    rows: Int[np.ndarray, " n"],
     confidence: float,
+    photos: Float[np.ndarray, "6 P"],
+    extent: float,
     focal: float,
     screens: tuple[float, float],
-    photos: Float[np.ndarray, "6 P"],
-) -> ViewModel:
-    heldout = np.zeros(len(x), bool)
-    mean = values.mean(0)
+) -> FidelityModel:
+    sampled, sight = part.sampled, part.sight
+    shares = sampled.pixels / sampled.image[:, None]
+    factors, average = factors_of(sight, shares), category.mean(0)
     # a last level that is the full model is known, and no part of the process (unless it is the only one)
-    known = bool((values[:, -1] == 1).all())
-    learnt = slice(0, max(len(mean) - known, 1))
-    process = fit_process(x, heldout, (values - mean)[:, learnt])
-    weights = np.zeros(values.shape)
-    weights[:, learnt] = process.weights
-    left_out = values.copy()
-    left_out[:, learnt] = mean[learnt] + process.left_out
-    left_out = monotone(left_out)
-    rmse = np.sqrt(((left_out - values) ** 2).mean(0))
-    near = matern32(x, x, process.lengths)
+    known = bool((category[:, -1] == 1).all())
+    learnt = slice(0, max(len(average) - known, 1))
+    seen = [np.flatnonzero(shares[:, column] >= CELL_SHARE) for column in part.columns]
+    inputs, offsets, rest, medians = [], [], [], []
+    for column, own in zip(part.columns, seen, strict=True):
+        values = sampled.fidelity[own, column].astype(np.float64)
+        distance = sight.distance[own, column]
+        logs = np.log(distance[distance > 0])
+        medians.append(float(np.median(logs)) if len(logs) else 0.0)
+        log = np.where(distance > 0, np.log(np.where(distance > 0, distance, 1.0)), medians[-1])
+        inputs.append(np.column_stack([views[own], log]))
+        offsets.append((values.sum(0) + _TOWARDS * average) / (len(own) + _TOWARDS))
+        rest.append((values - offsets[-1])[:, learnt])
+    process = fit_together(inputs, rest)
+    cells, left_out = [], np.full((*shares.shape, len(average)), np.nan)
+    for i, (column, own) in enumerate(zip(part.columns, seen, strict=True)):
+        weights = np.zeros((len(own), len(average)))
+        weights[:, learnt] = process.weights[i]
+        found = sampled.fidelity[own, column].astype(np.float64)
+        found[:, learnt] = offsets[i][learnt] + process.left_out[i]
+        left_out[own, column] = monotone(found)
+        cells.append(
+            CellModel(part.ids[i], offsets[i], own, inputs[i][:, 7], medians[i], weights, factors[:, column])
+        )
+    # the category at equal levels, from its cells without the view
+    weight = np.where(np.isnan(left_out[:, part.columns, 0]), 0, shares[:, part.columns])[rows]
+    sums = np.einsum("vc,vck->vk", weight, np.nan_to_num(left_out[:, part.columns])[rows])
+    total = weight.sum(1, keepdims=True)
+    without = np.where(total > 0, sums / np.where(total > 0, total, 1), average)
+    near = matern32(views, views, process.lengths[:3])
     np.fill_diagonal(near, 0)
-    least = float(near.max(1).min())  # each by the others
-    scale = AT_A_PHOTO + away_from(x, photos, near.max(1))
+    scale = AT_A_PHOTO + away_from(views[rows], photos, near[rows].max(1))
     margins = np.clip(
         [
-            np.quantile(critical_margins(left_out, values, target, scale), confidence, method="higher")
+            np.quantile(critical_margins(without, category, target, scale), confidence, method="higher")
             for target in TARGETS
         ],
         *_MARGINS,
     )
-    return ViewModel(
+    return FidelityModel(
         label_id=label,
-        quality="fidelity",
-        curves=tuple(
-            constant_curve(label, k, float(m), float(e), len(x))
-            for k, m, e in zip(range(1, len(mean) + 1), mean, rmse, strict=True)
-        ),
         extent=extent,
-        median_log_distance=median,
         focal=focal,
         screens=screens,
-        inputs=x,
-        heldout_inputs=heldout,
+        views=views,
         lengths=process.lengths,
-        heldout_variance=0.0,
         photos=photos,
-        weights=weights,
-        rmse=float(rmse.mean()),
+        cells=tuple(cells),
+        rmse=float(np.sqrt(((without - category) ** 2).mean(0)).mean()),
         calibration=_calibration(
-            TARGETS + AT_A_PHOTO * margins, margins, "uncalibrated", confidence, 0, least
+            TARGETS + AT_A_PHOTO * margins, margins, "uncalibrated", confidence, 0,
+            float(near[rows].max(1).min()),
         ),
-    )
+    )  # fmt: skip
 
 
 def photo_places(photos: Sequence[Camera], extent: float) -> Float[np.ndarray, "6 P"]:
@@ -178,20 +202,24 @@ def _calibration(
 
 
 def plan_nominal(
-    models: Mapping[int, ViewModel],
-    labels: Sequence[int],
-    levels: int,
-    distance: Float[np.ndarray, "V L"],
-    cameras: Sequence[Camera],
+    models: Mapping[int, FidelityModel],
+    expected: Expected,
+    cost: Int[np.ndarray, "C K"],
     nominal: Float[np.ndarray, " J"],
-) -> Int[np.ndarray, "V J L"]:
-    """The lowest level (1 to `levels`) whose bound reaches each nominal target; the last without a bound."""
-    planned = np.full((len(cameras), len(nominal), len(labels)), levels)
-    for column, label in enumerate(labels):
-        if label in models:
-            bound = _bounds(models[label], distance[:, column], cameras)
-            reached = bound[:, None, :] >= nominal[:, None]
-            planned[..., column] = np.where(reached.any(2), reached.argmax(2) + 1, levels)
+) -> Int[np.ndarray, "V J C"]:
+    """The levels (from 1) of the fewest bytes by which each category reaches each nominal target.
+
+    A category is at its last level where nothing is promised, and a cell out of sight at its first one.
+    `cost`: bytes of each cell's levels.
+    """
+    V, C, K = expected.mean.shape
+    planned = np.ones((V, len(nominal), C), int)
+    for j, target in enumerate(nominal):
+        least = needed(models, expected, float(target))
+        for row in range(V):
+            planned[row, j] = reach(
+                cost, expected.mean[row], expected.share[row], expected.column, least[row]
+            ).levels + 1
     return planned
 
 
@@ -200,22 +228,18 @@ class Trial:
     """Compositions planned for NOMINAL at viewpoints of one set, and what they measured."""
 
     labels: Sequence[int]  # of the columns, ascending
-    cameras: Sequence[Camera]
-    distance: Float32[np.ndarray, "V L"]  # d_min, world units
     shown: Bool[np.ndarray, "V L"]  # whether a viewpoint shows enough of a category to count
-    planned: Int[np.ndarray, "V J L"]  # levels, 1 to K
-    fidelity: Float32[np.ndarray, "V J L+1"]  # the last column is the whole image
+    support: Float[np.ndarray, "V L"]  # of the viewpoints; NaN without a model
+    fidelity: Float32[np.ndarray, "V J L"]
 
     def views(self, label: int) -> Int[np.ndarray, " n"]:
         """Rows of the viewpoints that show a category."""
         return np.flatnonzero(self.shown[:, list(self.labels).index(label)])
 
-    def critical(self, model: ViewModel) -> Float[np.ndarray, "G n"]:
+    def critical(self, label: int) -> Float[np.ndarray, "G n"]:
         """For each of TARGETS the critical nominal target in the viewpoints that show the category."""
-        column, rows = list(self.labels).index(model.label_id), self.views(model.label_id)
-        bound = _bounds(model, self.distance[rows, column], [self.cameras[row] for row in rows])
-        taken, got = self.planned[rows, :, column] - 1, self.fidelity[rows, :, column]
-        return np.stack([critical_nominals(bound, NOMINAL, taken, got, target) for target in TARGETS])
+        got = self.fidelity[self.views(label)][..., list(self.labels).index(label)]
+        return np.stack([critical_nominals(NOMINAL, got, target) for target in TARGETS])
 
     def missed(self, label: int) -> Int[np.ndarray, " J"]:
         """In how many of these viewpoints each of NOMINAL was missed."""
@@ -223,23 +247,20 @@ class Trial:
         got = self.fidelity[rows][..., list(self.labels).index(label)]
         return (got < NOMINAL).sum(0)
 
-    def least_support(self, model: ViewModel) -> float:
+    def least_support(self, label: int) -> float:
         """The least support of any of these viewpoints: further away nothing was tried."""
-        column, rows = list(self.labels).index(model.label_id), self.views(model.label_id)
-        distance = self.distance[rows, column].astype(np.float64)
-        x = model.inputs_at(distance, *where([self.cameras[row] for row in rows], model.focal))
-        return float(matern32(x, model.inputs, model.lengths).max(1).min())
+        return float(self.support[self.views(label), list(self.labels).index(label)].min())
 
 
 def remove_composition_bias(
-    models: Mapping[int, ViewModel], trial: Trial, confidence: float
-) -> dict[int, ViewModel]:
+    models: Mapping[int, FidelityModel], trial: Trial, confidence: float
+) -> dict[int, FidelityModel]:
     """The models with thresholds that allow for the neighbours' levels; `trial` was planned with the models.
 
     This is no calibration: it brings what is calibrated close to what is asked.
     """
     return {
-        label: _asked(model, _empirical(trial.critical(model), confidence))
+        label: _asked(model, _empirical(trial.critical(label), confidence))
         if len(trial.views(label))
         else model
         for label, model in models.items()
@@ -247,8 +268,8 @@ def remove_composition_bias(
 
 
 def hold_all_categories(
-    models: Mapping[int, ViewModel], trial: Trial, confidence: float
-) -> tuple[dict[int, ViewModel], Bool[np.ndarray, " G"]]:
+    models: Mapping[int, FidelityModel], trial: Trial, confidence: float
+) -> tuple[dict[int, FidelityModel], Bool[np.ndarray, " G"]]:
     """The same, and targets at which all categories are held for those that cannot help themselves.
 
     `trial` was planned with models of `remove_composition_bias`. A category that still misses a target in
@@ -259,7 +280,7 @@ def hold_all_categories(
     for label, model in models.items():
         if not (views := len(trial.views(label))):
             continue
-        asked[label] = _empirical(trial.critical(model), confidence)
+        asked[label] = _empirical(trial.critical(label), confidence)
         if views < fewest_views(confidence):
             continue
         chance = views * (1 - confidence) + _NOISE_SIGMAS * np.sqrt(views * confidence * (1 - confidence))
@@ -278,11 +299,11 @@ def _empirical(critical: Float[np.ndarray, "G n"], confidence: float) -> Float[n
 
 
 def calibrated(
-    models: Mapping[int, ViewModel],
+    models: Mapping[int, FidelityModel],
     trial: Trial,
     confidence: float,
     held: Bool[np.ndarray, " G"] = NOTHING_HELD,
-) -> dict[int, ViewModel]:
+) -> dict[int, FidelityModel]:
     """The models with thresholds that keep each target at a confidence.
 
     Args:
@@ -298,7 +319,7 @@ def calibrated(
     fewest, asked = fewest_views(confidence), {}
     for label, model in models.items():
         if len(trial.views(label)) >= fewest:
-            values = [conformal_quantile(values, confidence) for values in trial.critical(model)]
+            values = [conformal_quantile(values, confidence) for values in trial.critical(label)]
             asked[label] = np.where(held, np.maximum(values, TARGETS), values)
     # nothing is known below the last level where not even one category could be calibrated
     widest = np.max([*asked.values()], axis=0) if asked else np.ones(len(TARGETS))
@@ -307,11 +328,11 @@ def calibrated(
         views = len(trial.views(label))
         nominal = asked.get(label)
         if nominal is None:
-            nominal = np.maximum(widest, trial.critical(model).max(1)) if views else widest
+            nominal = np.maximum(widest, trial.critical(label).max(1)) if views else widest
         made = _asked(model, nominal)
         status = "calibrated" if label in asked else "uncalibrated"
         least = model.calibration.least_support
-        least = min(least, trial.least_support(model)) if views else least
+        least = min(least, trial.least_support(label)) if views else least
         calibration = replace(
             made.calibration, status=status, confidence=confidence, num_views=views, least_support=least
         )
@@ -319,7 +340,7 @@ def calibrated(
     return found
 
 
-def _asked(model: ViewModel, nominal: Float[np.ndarray, " G"]) -> ViewModel:
+def _asked(model: FidelityModel, nominal: Float[np.ndarray, " G"]) -> FidelityModel:
     """The model with the thresholds at which its present bound is `nominal`, the ones to ask for TARGETS."""
     now = model.calibration
     low = nominal - (now.targets[0] - now.thresholds[0])  # below the first target, as `Calibration.bound`
@@ -330,11 +351,3 @@ def _asked(model: ViewModel, nominal: Float[np.ndarray, " G"]) -> ViewModel:
         thresholds, slopes, now.status, now.confidence, now.num_views, now.least_support
     )
     return replace(model, calibration=calibration)
-
-
-def _bounds(
-    model: ViewModel, distance: Float32[np.ndarray, " V"], cameras: Sequence[Camera]
-) -> Float[np.ndarray, "V K"]:
-    """The model's bounds at viewpoints; -1 where it gives none."""
-    at = where(cameras, model.focal)
-    return np.nan_to_num(model.predict(distance.astype(np.float64), *at).bound, nan=-1.0)

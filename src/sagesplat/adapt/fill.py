@@ -85,7 +85,7 @@ def _fill(levels, value, cost, weight, lowest):
     for label in range(L):
         nbytes += cost[label, levels[label]]
         worth += value[label, levels[label]]
-        tops[label], slopes[label] = _next(cost[label], value[label], levels[label])
+        tops[label], slopes[label] = next_upgrade(cost[label], value[label], levels[label])
     uniform_bytes, uniform, uniform_lowest = cost.sum(0), value.sum(0), _lowest_of_levels(value, weight)
     while total > 0:
         label = -1
@@ -103,7 +103,7 @@ def _fill(levels, value, cost, weight, lowest):
         nbytes += cost[label, at] - cost[label, before]
         worth += value[label, at] - value[label, before]
         levels[label] = at
-        tops[label], slopes[label] = _next(cost[label], value[label], at)
+        tops[label], slopes[label] = next_upgrade(cost[label], value[label], at)
     return levels
 
 
@@ -129,7 +129,7 @@ def _lowest_of_levels(value, weight):
 
 
 @njit(cache=True, error_model="numpy")
-def _next(cost, value, at):
+def next_upgrade(cost, value, at):
     """The next vertex of the hull after level `at`, and the slope to it; -1, 0 where nothing gains."""
     best, most, fewest, highest = -1, 0.0, 0.0, 0.0
     for k in range(at + 1, len(cost)):

@@ -95,10 +95,10 @@ class RecordedLadder(Ladder):
 
 @dataclass(frozen=True)
 class PrefixLadder(Ladder):
-    """Ours: one ordered set of Gaussians per category, of which each level is a range of rows.
+    """One ordered set of Gaussians per cell, of which each level is a range of rows.
 
-    Level k of a category ends at row `sizes[label][k - 1]`. It begins at row 0; or, where it or a level below
-    replaces what is below it, where that begins (`starts`).
+    Ids, those of its Gaussians included, are ids of cells. Level k of a cell ends at row `sizes[cell][k - 1]`.
+    It begins at row 0; or, where it or a level below replaces what is below it, where that begins (`starts`).
     """
 
     path: Path
@@ -167,6 +167,55 @@ class PrefixLadder(Ladder):
         return composed(self.gaussians, self.second, self.ranges, levels)
 
 
+@dataclass(frozen=True)
+class NestedLadder(Ladder):
+    """Ours: the levels of categories, each of which has its cells at the same level."""
+
+    cells: PrefixLadder
+    label_of: dict[int, int]  # label id by cell id
+
+    @property
+    def levels(self) -> list[int]:
+        """1 to K."""
+        return self.cells.levels
+
+    @cached_property
+    def counts(self) -> dict[tuple[int, int], int]:
+        """Gaussians of each (label id, level)."""
+        found: dict[tuple[int, int], int] = {}
+        for (cell, level), count in self.cells.counts.items():
+            key = self.label_of[cell], level
+            found[key] = found.get(key, 0) + count
+        return dict(sorted(found.items()))
+
+    def load(self, level: int, label_ids: Sequence[int] | None = None) -> Gaussians:
+        """See `Ladder`."""
+        labels = set(self.label_of.values()) if label_ids is None else label_ids
+        return self.compose(dict.fromkeys(labels, level))
+
+    def compose(self, levels: Mapping[int, int]) -> Gaussians:
+        """See `Ladder`."""
+        return self.compose_cells(self.of_cells(levels))
+
+    def of_cells(self, levels: Mapping[int, int]) -> dict[int, int]:
+        """Level by cell id, from levels by label id."""
+        return {cell: levels[label] for cell, label in self.label_of.items() if label in levels}
+
+    def compose_cells(self, levels: Mapping[int, int]) -> Gaussians:
+        """The union over cells of the Gaussians of each at its level (cell id -> level), by category."""
+        return self.by_label(self.cells.compose(levels))
+
+    def by_label(self, g: Gaussians) -> Gaussians:
+        """Gaussians of cells with the label ids of their categories, the rows of each together."""
+        ids = np.array(sorted(self.label_of))
+        labels = np.array([self.label_of[cell] for cell in ids.tolist()], np.int16)
+        found = torch.from_numpy(labels[np.searchsorted(ids, g.label_ids.cpu().numpy())]).to(g.label_ids.device)
+        g = replace(g, label_ids=found)
+        if (found[1:] < found[:-1]).any():
+            g = g.select(torch.argsort(found, stable=True))
+        return g
+
+
 def composed(
     g: Gaussians,
     second: SecondOpacities | None,
@@ -201,7 +250,7 @@ def read_ladder(folder: Path) -> RecordedLadder:
 
 
 def read_prefixes(path: Path) -> PrefixLadder:
-    """The nested ladder in a file."""
+    """The nested ladder in a file, by cell."""
     if not path.exists():
         raise RunError(f"{path}: no nested ladder; run `sagesplat nest` first")
     sizes = read_sizes(path)

@@ -70,6 +70,15 @@ def matern32(
     return (1 + scaled_distance) * np.exp(-scaled_distance)
 
 
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Processes with the same hyperparameters; weights and views left out of each, as of `Process`."""
+
+    lengths: tuple[float, float, float, float]
+    weights: list[Float[np.ndarray, "n K"]]
+    left_out: list[Float[np.ndarray, "n K"]]
+
+
 def fit_process(
     x: Float[np.ndarray, "n 8"], heldout: Bool[np.ndarray, " n"], values: Float[np.ndarray, "n K"]
 ) -> Process:
@@ -83,19 +92,39 @@ def fit_process(
     Returns:
         The process, and for each view what is predicted without it.
     """
-    squares = [cdist(x[:, group], x[:, group], "sqeuclidean") for group in GROUPS]
-    theta = _hyperparameters(squares, heldout, values)
+    part = _squares(x), heldout, values
+    theta = _hyperparameters([part])
+    weights, left_out = _solved(part, theta)
+    position, direction, screen, distance, heldout_variance, noise = np.exp(theta).tolist()
+    lengths = position, direction, screen, distance
+    return Process(lengths, heldout_variance, noise, weights, left_out)
+
+
+def fit_together(inputs: Sequence[Float[np.ndarray, "_ 8"]], values: Sequence[np.ndarray]) -> Together:
+    """Fit processes of zero mean that differ in their values [n, K] alone, each at n >= 0 viewpoints."""
+    parts = [(_squares(x), np.zeros(len(x), bool), v) for x, v in zip(inputs, values, strict=True)]
+    theta = _hyperparameters([part for part in parts if len(part[2])])
+    solved = [_solved(part, theta) for part in parts]
+    position, direction, screen, distance, *_ = np.exp(theta).tolist()
+    lengths = position, direction, screen, distance
+    return Together(lengths, [weights for weights, _ in solved], [left_out for _, left_out in solved])
+
+
+_Part = tuple[list[np.ndarray], np.ndarray, np.ndarray]  # squared distances by group, heldout, values
+
+
+def _squares(x: np.ndarray) -> list[np.ndarray]:
+    return [cdist(x[:, group], x[:, group], "sqeuclidean") for group in GROUPS]
+
+
+def _solved(part: _Part, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights, and what is predicted of each view without it."""
+    squares, heldout, values = part
+    if not len(values):
+        return values, values
     inverse, _ = _inverse(_terms(squares, heldout, theta)[0])
     weights = inverse @ values
-    own = np.diag(inverse)[:, None]
-    position, direction, screen, distance, heldout_variance, noise = np.exp(theta).tolist()
-    return Process(
-        lengths=(position, direction, screen, distance),
-        heldout_variance=heldout_variance,
-        noise=noise,
-        weights=weights,
-        left_out=values - weights / own,
-    )
+    return weights, values - weights / np.diag(inverse)[:, None]
 
 
 def _terms(
@@ -121,25 +150,24 @@ def _variances(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return (values * weights).mean(0) + (FEW / len(values)) ** 2
 
 
-def _hyperparameters(squares: list[np.ndarray], u: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _hyperparameters(parts: Sequence[_Part]) -> np.ndarray:
     """Logs of lengths, heldout variance and noise: those of the smallest `_cost` within bounds."""
     reach = PRIOR_REACH * PRIOR_WIDTH
     bounds = list(zip(PRIOR - reach, PRIOR + reach, strict=True))
     options = {"maxiter": 50}
-    return minimize(
-        _cost, PRIOR, (squares, u, values), jac=True, method="L-BFGS-B", bounds=bounds, options=options
-    ).x
+    return minimize(_cost, PRIOR, (parts,), jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
 
 
-def _cost(
-    theta: np.ndarray, squares: list[np.ndarray], u: np.ndarray, values: np.ndarray
-) -> tuple[float, np.ndarray]:
+def _cost(theta: np.ndarray, parts: Sequence[_Part]) -> tuple[float, np.ndarray]:
     """Negative log of the marginal likelihood, mean over levels, times the prior; and its derivatives."""
-    S, slopes = _terms(squares, u, theta)
-    inverse, log_determinant = _inverse(S)
-    weights = inverse @ values
-    variances = _variances(values, weights)
     z = (theta - PRIOR) / PRIOR_WIDTH
-    value = (len(u) * np.log(variances).mean() + log_determinant + z @ z) / 2
-    slope = (inverse - (weights / variances) @ weights.T / len(variances)) / 2
-    return value, np.array([(slope * s).sum() for s in slopes]) + z / PRIOR_WIDTH
+    value, slope = z @ z / 2, z / PRIOR_WIDTH
+    for squares, u, values in parts:
+        S, slopes = _terms(squares, u, theta)
+        inverse, log_determinant = _inverse(S)
+        weights = inverse @ values
+        variances = _variances(values, weights)
+        value += (len(u) * np.log(variances).mean() + log_determinant) / 2
+        part = (inverse - (weights / variances) @ weights.T / len(variances)) / 2
+        slope = slope + np.array([(part * s).sum() for s in slopes])
+    return value, slope

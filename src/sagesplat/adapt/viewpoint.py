@@ -83,7 +83,7 @@ class Calibration:
         away = 1 - support if away is None else away
         if not len(self.targets):
             return np.full(mean.shape, np.nan)
-        needed = np.minimum(np.maximum.accumulate(self.thresholds + np.outer(away, self.slopes), 1), 1)
+        needed = self._needed(away)
         found = np.array(
             [np.interp(m, n, self.targets) for m, n in zip(mean, needed, strict=True)], np.float64
         ).reshape(mean.shape)
@@ -91,6 +91,18 @@ class Calibration:
         found = np.where(low, mean + (self.targets[0] - needed[:, :1]), found)
         found[support < self.least_support] = np.nan
         return found
+
+    def needed(self, target: float, away: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
+        """The mean from which on a target is kept, this far away; between targets it is interpolated."""
+        if not len(self.targets):
+            return np.full(len(away), np.nan)
+        known = self._needed(away)
+        found = np.array([np.interp(target, self.targets, row) for row in known])
+        return np.where(target < self.targets[0], known[:, 0] - (self.targets[0] - target), found)
+
+    def _needed(self, away: Float[np.ndarray, " V"]) -> Float[np.ndarray, "V G"]:
+        """The mean that each of the targets needs."""
+        return np.minimum(np.maximum.accumulate(self.thresholds + np.outer(away, self.slopes), 1), 1)
 
 
 NO_CALIBRATION = Calibration("uncalibrated", 0.95, 0, np.zeros(0), np.zeros(0), np.zeros(0), 0.0)

@@ -201,8 +201,9 @@ class NestConfig:
     lowest levels; 0: none."""
     base_steps: PositiveInt31 = 1600
     """Training steps of the base model, which begins with the trained model, merged to that size."""
-    full_share: Share = 0.1
-    """Fraction of the first steps that sample the full model; rises linearly to 90 % of the last ones."""
+    cells: Annotated[int, Meta(ge=0, le=4096)] | Literal["auto"] = "auto"
+    """Parts of categories by place, in all, that have levels of their own; 0: each category is one (auto: by
+    the number of Gaussians, at most 64)."""
     rate_weight: NotNegative = 6e-4
     """Loss per bit that the SH coefficients of a Gaussian take in a coded stream, on average; 0: only how it
     looks counts."""

@@ -8,8 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from sagesplat.adapt.cells import Cells, read_cells
 from sagesplat.adapt.fidelity import References
-from sagesplat.adapt.ladder import Ladder, RecordedLadder, read_ladder, read_prefixes
+from sagesplat.adapt.ladder import (
+    Ladder,
+    NestedLadder,
+    PrefixLadder,
+    RecordedLadder,
+    read_ladder,
+    read_prefixes,
+)
 from sagesplat.adapt.observe import PERCENTILE, distances_in_views
 from sagesplat.core.config import FitConfig
 from sagesplat.core.errors import RunError
@@ -260,15 +268,27 @@ class Job:
     def ladder(self) -> Ladder:
         """The levels to choose from: prefixes of the nested model, or those that training recorded."""
         nested = self.run.ladder == "nested"
-        ladder = read_prefixes(self.run.prefixes) if nested else self.recorded
+        ladder = NestedLadder(read_prefixes(self.run.prefixes), self.cells.label_of) if nested else self.recorded
         path = self.run.prefixes if nested else self.run.levels
         self.check_named(path, sorted({label for label, _ in ladder.counts}))
         return ladder
 
     @cached_property
+    def cells(self) -> Cells:
+        """The cells of the nested levels."""
+        return read_cells(self.run.cells)
+
+    @property
+    def by_cell(self) -> PrefixLadder:
+        """The nested levels by cell."""
+        ladder = self.ladder
+        assert isinstance(ladder, NestedLadder)
+        return ladder.cells
+
+    @cached_property
     def references(self) -> References:
-        """What compositions of the ladder's levels are compared with."""
-        return References(self.ladder, self.backend, self.antialiased, full=self.came_in)
+        """What compositions of the cells' levels are compared with."""
+        return References(self.by_cell, self.backend, self.antialiased, full=self.came_in)
 
     def check_named(self, path: Path, label_ids: Iterable[int]) -> None:
         """RunError for an id that the run's labels.json does not name."""

@@ -96,6 +96,7 @@ class RunDir:
     base_model = _In("base.npz", "adapted")  # the small model that the nested ladder begins with
     nest_checkpoint = _In("checkpoint.npz", "adapted")  # where training on compositions goes on
     prefixes = _In("ladder.npz", "adapted")  # one ordered set of Gaussians: the levels are prefixes of it
+    cells = _In("cells.npz", "adapted")  # parts of categories by place, which have levels of their own
     increments = _In("increments", "adapted")  # what each level of each category adds, with index.json
     observations = _In("observations.csv", "adapted")  # quality per category, level and view
     viewpoints = _In("viewpoints.json", "adapted")  # drawn viewpoints, and the rule that they were drawn by

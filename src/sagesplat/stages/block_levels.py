@@ -68,11 +68,12 @@ def nest_scene(job: Job, nest: NestConfig, seed: int) -> None:
             for number in every:
                 run.block(number).provenance("boundaries").unlink(missing_ok=True)
         merged = together(files)
-        lines = write_ladder(job, merged.gaussians, merged.sizes, nest, merged.second)
+        one_each = {part: part for part in merged.sizes}
+        lines = write_ladder(job, merged.gaussians, merged.sizes, one_each, nest, merged.second)
         return [*lines, f"{len(blocks)} blocks, {steps} steps of boundary tuning each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.cells, run.increments], make, swaps=True)
     measure_borders(job)
 
 
@@ -83,7 +84,7 @@ def nest_block(
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
     labels = (run.instances if job.run.has_instances else run.masks) / "labels.json"
-    nest_levels(job, config, seed)
+    nest_levels(job, replace(config, cells=0), seed)  # a part of a category in a block is a cell
 
     def make() -> list[str]:
         blocks = read_blocks(partition)

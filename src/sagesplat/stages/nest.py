@@ -1,9 +1,11 @@
 """Makes the nested levels and their increments, from the trained Gaussians: orders them, trains prefixes."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 
 import numpy as np
 
+from sagesplat.adapt.cells import describe_cells, write_cells
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.core.config import NestConfig
 from sagesplat.core.events import Progress, Warned
@@ -19,6 +21,7 @@ from sagesplat.stages.memory import check_nest
 from sagesplat.stages.shared import existing, inlier_inputs, label_image_inputs, train_config
 from sagesplat.train import nested
 from sagesplat.train.base_model import merged_start
+from sagesplat.train.cells import cells_wanted
 from sagesplat.train.checkpoint import can_resume, remove_checkpoints
 from sagesplat.train.early_stopping import VIEWS, spread
 from sagesplat.train.events import Resumed, Step, Trained
@@ -44,6 +47,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
             full, job.scene, masks,
             base=base, valid=job.inliers, antialiased=job.antialiased, shell=shell,
         )  # fmt: skip
+        wanted = cells_wanted(len(ordered.gaussians)) if config.cells == "auto" else config.cells
+        ordered, label_of = nested.in_cells(ordered, wanted)
         key = checkpoint_key(run, settings, inputs)
         if job.force and not can_resume(run.nest_checkpoint, key):
             remove_checkpoints(run.nest_checkpoint)
@@ -51,7 +56,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
         for event in nested.nest(
             ordered, job.scene, job.photos, train_config(job), config,
             valid=job.inliers, seed=seed, backend=job.backend, checkpoint=run.nest_checkpoint, settings=key,
-            shell=shell,
+            shell=shell, label_of=label_of,
         ):  # fmt: skip
             if isinstance(event, NestStep):
                 job.emit(Progress("nest", event.step, config.steps, f"loss {event.loss:.3f}"))
@@ -60,10 +65,10 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
                 job.emit(Warned(f"resuming from step {event.step}, {before}"))
             else:
                 trained = event
-        sizes = {label: nested.level_sizes(n, config) for label, n in trained.gaussians.counts().items()}
+        sizes = {cell: nested.level_sizes(n, config) for cell, n in trained.gaussians.counts().items()}
         second = trained.second_opacities
         second = None if second is None else SecondOpacities.of_levels(second, sizes)
-        lines = write_ladder(job, trained.gaussians, sizes, config, second)
+        lines = write_ladder(job, trained.gaussians, sizes, label_of, config, second)
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -72,7 +77,7 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
     if config.base_share:
         _make_base_model(job, config, seed)
         inputs.append(run.base_model)
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.cells, run.increments], make, swaps=True)
 
 
 def _make_base_model(job: Job, config: NestConfig, seed: int) -> None:
@@ -120,21 +125,24 @@ def write_ladder(
     job: Job,
     g: Gaussians,
     sizes: dict[int, tuple[int, ...]],
+    label_of: Mapping[int, int],
     config: NestConfig,
     second: SecondOpacities | None = None,
 ) -> list[str]:
-    """Write Gaussians in their order, with levels of `sizes` by label id, as the run's ladder and increments.
+    """Write Gaussians in their order, with levels of `sizes` by cell id, as the run's ladder and increments.
 
     `second` is kept beside them. Gaussians that are hardly to be seen are left out. Returns lines that sum
     it up.
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     made = write_streams(
-        job.run.increments, g, sizes, job.names(), second=second, antialiased=job.antialiased
+        job.run.increments, g, sizes, job.names(), label_of=label_of, second=second,
+        antialiased=job.antialiased,
     )  # fmt: skip
     # what is measured, planned and written from here on is what a viewer gets
     sent, seconds = read_streams(job.run.increments, made.increments)
     write_set(job.run.prefixes, sent, config.steps, made.sizes, second=seconds)
+    write_cells(job.run.cells, describe_cells(sent, {cell: label_of[cell] for cell in made.sizes}))
     size, n = sum(one.nbytes for one in made.increments), len(sent)
     decoded, unrounded = _quality(job, sent, seconds), _quality(job, g, second)
     if unrounded - decoded > _ROUNDED:
@@ -145,8 +153,8 @@ def write_ladder(
             )
         )
     return [
-        f"{config.levels} levels, {len(g):,} Gaussians",
-        f"{n:,} of them to be seen, in {len(made.sizes)} coded streams of {size / 1e6:.2f} MB, "
+        f"{config.levels} levels of {len(made.sizes)} cells, {len(g):,} Gaussians",
+        f"{n:,} of them to be seen, in coded streams of {size / 1e6:.2f} MB, "
         f"{size / n:.1f} bytes a Gaussian; "
         f"training views: SSIM {decoded:.4f} as decoded, {unrounded:.4f} before rounding",
     ]

@@ -42,7 +42,7 @@ from sagesplat.stages.scene import check_not_adopted, open_scene
 # the built-in capture, within minutes on two cores
 DEMO = RunConfig(
     train=TrainConfig(max_steps=1200, level_every=60),
-    nest=NestConfig(steps=600, levels=12, base_steps=250, full_share=0.3),
+    nest=NestConfig(steps=600, levels=12, base_steps=250),
     plan=PlanConfig(target_fidelity=0.9),
 )
 WILD_DEMO = replace(

@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int8
+from jaxtyping import Bool, Float32, Int, Int8
 from torch import Tensor
 
 from sagesplat.core import geometry
@@ -21,6 +22,7 @@ from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
+from sagesplat.train.cells import split_cells
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.events import Event, Resumed
@@ -36,7 +38,9 @@ from sagesplat.train.votes import label_weights, winners
 # docs/developers/nested.md compares these
 _LR_MULTIPLIER, _SHRINK_TO = 4.0, 0.05  # of 3DGS's late learning rates: at first, and what is left of it
 _DRAWN_FROM = 0.03  # smallest prefix that a step draws; less favours categories that are easy to represent
-_FULL_SHARE_END = 0.9  # of the last steps draw the full model
+_FULL_SHARE, _FULL_SHARE_END = 0.1, 0.9  # of the first and of the last steps draw the full model
+_SHORT, _FULL_SHARE_SHORT = 1000, 0.3  # of fewer steps the first share is this: else the full model suffers
+_BY_CELL = 0.5  # of the steps draw a prefix for each cell, not for each category
 _SAVE_EVERY = 500
 _AVERAGE_EVERY = 5
 _NEARLY_FULL, _NEARLY_FROM = 0.2, 0.4  # share of the full steps that draw less, and the least prefix of these
@@ -46,7 +50,7 @@ _SORT_BY, _FEWEST = 3, 20  # each time another third of the views says how to so
 
 @dataclass(frozen=True, eq=False)
 class Nested:
-    """Gaussians in the order in which they are sent: by category, the most important first."""
+    """Gaussians in the order in which they are sent: by cell, or category, the most important first."""
 
     gaussians: Gaussians
     of_base: Bool[np.ndarray, " N"]  # of the base model, which comes first in each category
@@ -112,6 +116,21 @@ def order(
     g = replace(g, label_ids=_labels(g, ids, weights, shell))
     rows = np.lexsort((-importances, ~of_base, g.label_ids.numpy()))  # the last key decides first
     return Nested(g.select(torch.from_numpy(rows)), of_base[rows])
+
+
+def in_cells(nested: Nested, count: int) -> tuple[Nested, dict[int, int]]:
+    """An ordered model split into about `count` cells, and the label id of each; the order within them stays.
+
+    The label ids of its Gaussians are then those of cells. 0: a category is a cell, of the same id.
+    """
+    g = nested.gaussians
+    if not count:
+        return nested, {label: label for label in g.counts()}
+    cells, label_of = split_cells(g.means.numpy(), g.label_ids.numpy(), count)
+    rows = np.argsort(cells, kind="stable")
+    order = torch.from_numpy(rows)
+    g = replace(g.select(order), label_ids=torch.from_numpy(cells[rows]))
+    return Nested(g, nested.of_base[rows]), label_of
 
 
 def _labels(
@@ -186,12 +205,13 @@ def nest(
     movable: np.ndarray | None = None,  # bool [N]
     spans: Spans | None = None,
     shell: Shell | None = None,
+    label_of: Mapping[int, int] = MappingProxyType({}),
 ) -> Iterator[NestStep | Resumed | Nested]:
     """Train a nested ladder: afterwards every composition of prefixes renders well.
 
     Each step draws a prefix of every category, log-uniform between 3 % and all of it, or the full model (with
-    a probability that rises from `config.full_share` to 0.9; a fifth of these steps draw prefixes between 40
-    and 100 %), and compares the composition with a photo. Values are rounded as the increments will hold
+    a probability that rises from 0.1, in short trainings 0.3, to 0.9; a fifth of these steps draw prefixes
+    between 40 and 100 %). In half of the steps each cell has a prefix of its own instead. It compares the composition with a photo. Values are rounded as the increments will hold
     them. The result is the mean of the last steps' values (at most 500 steps, or a fifth): prefixes pull in
     different directions to the end. Gaussians outside the composition, and their Adam moments, stay as they
     are. Prefixes are drawn with the opacities that they have, between the first and the second ones. At five
@@ -211,6 +231,7 @@ def nest(
         movable: bool [N]; the others keep their values, and all keep their order. None: all are trained.
         spans: Levels that replace each other; all Gaussians keep their order. None: prefixes.
         shell: Gaussians that lie on it stay on it (see `train.sky`).
+        label_of: Label id by cell id, where the label ids of Gaussians are those of cells.
 
     Yields:
         `NestStep` at every step, `Resumed` after a damaged checkpoint, and the trained `Nested` last.
@@ -234,6 +255,7 @@ def nest(
     state = state.to(device)
     categories, column = np.unique(labels, return_inverse=True)
     column = torch.from_numpy(column).to(device)
+    of_cells = np.unique([label_of.get(cell, cell) for cell in categories.tolist()], return_inverse=True)[1]
     views = scene.train_ids.tolist()
     stays = movable is not None or spans is not None
     sort_at = [] if stays else [round(part * config.steps) for part in SORT_AT]
@@ -259,7 +281,7 @@ def nest(
                 )  # fmt: skip
                 state.order_share = order_shares(labels, of_base, importances).to(device)
             if edges is None:
-                rows, weights = _draw_prefixes(state, column, len(categories), config)
+                rows, weights = _draw_prefixes(state, column, of_cells, config)
             else:
                 assert spans is not None
                 rows, weights = _draw_levels(state, column, len(categories), edges, spans.levels), None
@@ -321,13 +343,13 @@ class TailAverage:
 
 
 def _draw_prefixes(
-    state: TrainState, column: Tensor, num_labels: int, config: NestConfig
+    state: TrainState, column: Tensor, of_cells: Int[np.ndarray, " C"], config: NestConfig
 ) -> tuple[Tensor | None, Tensor | None]:
     """Indices of the Gaussians that a step draws (None: all), and weights [N] of second opacities, if any.
 
-    `column` [N]: of each Gaussian's category.
+    `column` [N]: of each Gaussian's cell; `of_cells`: of each cell's category.
     """
-    prefix = draw_shares(state.rng, num_labels, config, state.step / config.steps)
+    prefix = draw_shares(state.rng, of_cells, config, state.step / config.steps)
     rows = weights = None
     if (prefix < 1).any():
         assert state.order_share is not None
@@ -370,15 +392,22 @@ def order_shares(labels: np.ndarray, first: np.ndarray, importances: np.ndarray)
 
 
 def draw_shares(
-    rng: np.random.Generator, num_labels: int, config: NestConfig, done: float
-) -> Float32[np.ndarray, " L"]:
-    """Prefix of each category that a step renders, as a share of it; `done`: share of the steps taken."""
-    full = config.full_share + (_FULL_SHARE_END - config.full_share) * done
+    rng: np.random.Generator, of_cells: Int[np.ndarray, " C"], config: NestConfig, done: float
+) -> Float32[np.ndarray, " C"]:
+    """Prefix of each cell that a step renders, as a share of it; `done`: share of the steps taken.
+
+    `of_cells`: the category of each, 0 to L - 1.
+    """
+    first = _FULL_SHARE_SHORT if config.steps < _SHORT else _FULL_SHARE
+    full = first + (_FULL_SHARE_END - first) * done
+    num_labels = int(of_cells.max()) + 1
+    if num_labels < len(of_cells) and rng.random() < _BY_CELL:
+        num_labels, of_cells = len(of_cells), np.arange(len(of_cells))
     if rng.random() < full:
         if rng.random() < _NEARLY_FULL:  # else levels of more than a half are hardly trained in the end
-            return rng.uniform(_NEARLY_FROM, 1, num_labels).astype(np.float32)
-        return np.ones(num_labels, np.float32)
-    return np.exp(rng.uniform(np.log(_DRAWN_FROM), 0, num_labels)).astype(np.float32)
+            return rng.uniform(_NEARLY_FROM, 1, num_labels).astype(np.float32)[of_cells]
+        return np.ones(len(of_cells), np.float32)
+    return np.exp(rng.uniform(np.log(_DRAWN_FROM), 0, num_labels)).astype(np.float32)[of_cells]
 
 
 def learning_rates(

@@ -1,0 +1,261 @@
+"""Models of fidelity: what to expect of each cell at each level from any viewpoint, promised by category.
+
+Levels are chosen cell by cell; what is promised is the category's fidelity, over the pixels of its cells:
+
+    mean_uk  = offset_uk + sum_i c(x, x_i) weights_uik, made monotone       of cell u at level k; c, x: the
+               kernel and the inputs of `adapt.process`, with the distance of the cell (`adapt.cells`)
+    share_u  = apparent_u * factor_u / max(1, sum over all cells)           of the picture's pixels
+    factor_u = (sum_i k_i v_ui + 0.001 v_u) / (sum_i k_i + 0.001)           k_i: by position and direction
+               v_ui: true share over `apparent` in view i, what others leave of the cell; v_u: their mean
+    mean     = sum_u share_u mean_u,level(u) / sum_u share_u                of the category's composition
+    needed   = threshold + slope * away                                     of a target (`adapt.viewpoint`)
+
+A target is kept where the mean reaches what is needed. A viewpoint's support is the kernel by position,
+direction and screen to the nearest known view; below `least_support` nothing is promised.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sagesplat.adapt.cells import Cells, Sight, look
+from sagesplat.adapt.process import inputs_of, matern32
+from sagesplat.adapt.viewpoint import (
+    NO_CALIBRATION,
+    PHOTO_LENGTHS,
+    Calibration,
+    QualityKind,
+    Status,
+    monotone,
+    where,
+)
+from sagesplat.core.limits import LARGEST, LabelId, Number, Positive
+from sagesplat.io.files import write_json
+from sagesplat.io.typed import read_json_as, refused, to_plain
+from sagesplat.scene.scene import Camera
+
+MOST_FACTOR = 4.0  # of a share over what it would be unhidden
+_PRIOR = 1e-3  # weight of a factor's mean
+
+
+@dataclass(frozen=True, eq=False)
+class CellModel:
+    """The fidelity of one cell; `rows` are views of its `FidelityModel`."""
+
+    cell: LabelId
+    offsets: Float[np.ndarray, " K"]  # mean of each level
+    rows: Int[np.ndarray, " n"]  # views behind the process; none: the offsets are all there is
+    log_distances: Float[np.ndarray, " n"]  # log of the cell's distance in them
+    median_log_distance: Number  # where it is unknown
+    weights: Float[np.ndarray, "n K"]
+    factors: Float[np.ndarray, " V"]  # v_ui of the module's text; -1: the view tells nothing
+
+
+@dataclass(frozen=True, eq=False)
+class FidelityModel:
+    """What fidelity to expect of one category (formulas: the module's text)."""
+
+    label_id: LabelId
+    extent: Positive  # of the scene, world units
+    focal: Positive  # of the photos, pixels: what screens are measured by
+    screens: tuple[Positive, Positive]  # from and to; what lies outside counts as the end of it
+    views: Float[np.ndarray, "V 7"]  # position / extent, direction, log screen
+    lengths: tuple[Positive, Positive, Positive, Positive]  # of the groups of inputs
+    photos: Float[np.ndarray, "6 P"]  # position / extent and direction of photos
+    cells: tuple[CellModel, ...]  # ascending
+    rmse: Number  # of the category at equal levels, each view predicted without itself; over all levels
+    calibration: Calibration = field(default=NO_CALIBRATION)
+    quality: QualityKind = "fidelity"
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """The levels that it predicts, ascending."""
+        return tuple(range(1, len(self.cells[0].offsets) + 1))
+
+    @property
+    def num_views(self) -> int:
+        """Views that show some of its cells."""
+        return len(np.unique(np.concatenate([cell.rows for cell in self.cells])))
+
+    @property
+    def status(self) -> Status:
+        """One of STATUSES."""
+        return self.calibration.status
+
+    @property
+    def confidence(self) -> float:
+        """Share of accepted decisions that hold."""
+        return self.calibration.confidence
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What is expected of C cells of L categories from V viewpoints."""
+
+    cells: Int[np.ndarray, " C"]  # ids, ascending
+    labels: Int[np.ndarray, " L"]  # ids, ascending; of categories without a model too
+    column: Int[np.ndarray, " C"]  # of each cell's category among the labels
+    mean: Float[np.ndarray, "V C K"]  # NaN: of a category without a model
+    share: Float[np.ndarray, "V C"]  # of the picture's pixels; 0: out of sight
+    support: Float[np.ndarray, "V L"]  # NaN without a model
+    away: Float[np.ndarray, " V"]  # 0 at a photo, 1 far from all
+
+    def category_shares(self) -> Float[np.ndarray, "V L"]:
+        """Share of the picture's pixels of each category."""
+        return self.share @ (self.column[:, None] == np.arange(len(self.labels)))
+
+    def of_composition(self, levels: Int[np.ndarray, "V C"]) -> Float[np.ndarray, "V L"]:
+        """Expected fidelity of each category in compositions (levels from 1); NaN out of sight."""
+        at = np.take_along_axis(self.mean, levels[..., None] - 1, 2)[..., 0]
+        member = self.column[:, None] == np.arange(len(self.labels))
+        seen = self.share > 0
+        value, weight = np.where(seen, self.share * at, 0) @ member, self.share @ member
+        return np.where(weight > 0, value / np.where(weight > 0, weight, 1), np.nan)
+
+
+def expect(
+    models: Mapping[int, FidelityModel], cells: Cells, cameras: Sequence[Camera], levels: int
+) -> Expected:
+    """What V cameras are expected to see of the cells, at each of `levels` levels."""
+    labels, column = np.unique(cells.labels, return_inverse=True)
+    sight = look(cells, cameras)
+    shape = len(cameras), len(cells.ids)
+    mean, factor = np.full((*shape, levels), np.nan), np.ones(shape)
+    support, away = np.full((len(cameras), len(labels)), np.nan), np.zeros(len(cameras))
+    place = {cell: i for i, cell in enumerate(cells.ids.tolist())}
+    for label, model in models.items():
+        known = inputs_at(model, cameras)
+        away = 1 - matern32(known[:, :6], model.photos.T, PHOTO_LENGTHS).max(1)
+        support[:, np.searchsorted(labels, label)] = matern32(known, model.views, model.lengths[:3]).max(1)
+        near = matern32(known[:, :6], model.views[:, :6], PHOTO_LENGTHS)
+        for cell in model.cells:
+            i = place[cell.cell]
+            mean[:, i] = cell_means(model, cell, known, sight.distance[:, i])
+            factor[:, i] = visible_factor(near, cell.factors)
+    share = sight.apparent * factor
+    share /= np.maximum(share.sum(1, keepdims=True), 1)
+    return Expected(cells.ids, labels, column, mean, share, support, away)
+
+
+def inputs_at(model: FidelityModel, cameras: Sequence[Camera]) -> Float[np.ndarray, "V 7"]:
+    """The inputs of viewpoints without distances."""
+    position, direction, screen = where(cameras, model.focal)
+    inside = np.clip(screen, *model.screens)
+    return inputs_of(np.ones(len(cameras)), position, direction, model.extent, 0.0, inside)[:, :7]
+
+
+def cell_means(
+    model: FidelityModel,
+    cell: CellModel,
+    known: Float[np.ndarray, "V 7"],
+    distance: Float[np.ndarray, " V"],
+) -> Float[np.ndarray, "V K"]:
+    """The mean of a cell's levels at viewpoints with these inputs and distances."""
+    mean = np.repeat(cell.offsets[None], len(known), 0)
+    if len(cell.rows):
+        seen = np.isfinite(distance) & (distance > 0)
+        log = np.where(seen, np.log(np.where(seen, distance, 1.0)), cell.median_log_distance)
+        own = np.column_stack([model.views[cell.rows], cell.log_distances])
+        mean = mean + matern32(np.column_stack([known, log]), own, model.lengths) @ cell.weights
+    return monotone(mean)
+
+
+def visible_factor(
+    near: Float[np.ndarray, "V N"], factors: Float[np.ndarray, " N"]
+) -> Float[np.ndarray, " V"]:
+    """What others leave of a cell, from what they leave in known views; `near`: the kernel to these."""
+    tells = factors >= 0
+    if not tells.any():
+        return np.ones(len(near))
+    weight = near[:, tells]
+    return (weight @ factors[tells] + _PRIOR * factors[tells].mean()) / (weight.sum(1) + _PRIOR)
+
+
+def factors_of(sight: Sight, shares: Float[np.ndarray, "V C"]) -> Float[np.ndarray, "V C"]:
+    """v_ui from the true shares of pixels."""
+    seen = sight.apparent > 0
+    found = shares / np.where(seen, sight.apparent, 1)
+    return np.where(seen, np.clip(found, 0, MOST_FACTOR), -1.0)
+
+
+def promised(
+    models: Mapping[int, FidelityModel], expected: Expected, composed: Float[np.ndarray, "V L"]
+) -> Float[np.ndarray, "V L"]:
+    """The largest target that each category keeps, by its composition's mean; NaN: nothing is promised."""
+    found = np.full(composed.shape, np.nan)
+    for column, label in enumerate(expected.labels.tolist()):
+        if label in models:
+            calibration = models[label].calibration
+            found[:, column] = calibration.bound(
+                composed[:, [column]], expected.support[:, column], expected.away
+            )[:, 0]
+    return found
+
+
+def needed(
+    models: Mapping[int, FidelityModel], expected: Expected, target: float
+) -> Float[np.ndarray, "V L"]:
+    """The mean from which on each category keeps a target; NaN: nothing is promised."""
+    found = np.full(expected.support.shape, np.nan)
+    for column, label in enumerate(expected.labels.tolist()):
+        if label in models:
+            calibration, support = models[label].calibration, expected.support[:, column]
+            least = support >= calibration.least_support
+            found[:, column] = np.where(least, calibration.needed(target, expected.away), np.nan)
+    return found
+
+
+def promise_possible(shares: Float[np.ndarray, "V L"], least: float) -> Bool[np.ndarray, "V L"]:
+    """Whether a category covers enough of a picture for a promise."""
+    return shares >= least
+
+
+def write_fidelity(path: Path, models: Mapping[int, FidelityModel]) -> None:
+    """fidelity.json: one entry per category."""
+    write_json(path, {"models": [to_plain(model) for model in models.values()]})
+
+
+@dataclass(frozen=True, eq=False)
+class _Models:
+    models: list[FidelityModel]
+
+
+def read_fidelity(path: Path | str) -> dict[int, FidelityModel]:
+    """What `write_fidelity` wrote; DataError where the content cannot be used."""
+    path, what, cure = Path(path), "a file of fidelity models", "delete it and run `sagesplat fit` again"
+    models = read_json_as(path, _Models, what, cure).models
+    with refused(path, what, cure):
+        for model in models:
+            _check(model)
+    return {model.label_id: model for model in models}
+
+
+def _check(model: FidelityModel) -> None:
+    """ValueError for a model whose parts do not belong together."""
+    V, calibration = len(model.views), model.calibration
+    if not model.cells or not len(model.cells[0].offsets) or not V or not model.photos.size:
+        raise ValueError("a model of nothing")
+    for cell in model.cells:
+        n, K = cell.weights.shape if len(cell.rows) else (0, len(cell.offsets))
+        if (len(cell.rows), len(cell.log_distances)) != (n, n) or len(cell.factors) != V:
+            raise ValueError("lists of unequal length")
+        if {K, len(cell.offsets)} != {len(model.levels)}:
+            raise ValueError("cells of unequal levels")
+        if n and not (0 <= cell.rows.min() and cell.rows.max() < V):
+            raise ValueError("views out of range")
+        numbers = cell.offsets, cell.log_distances, cell.weights, cell.factors
+        if not all((np.abs(array) < LARGEST).all() for array in numbers):
+            raise ValueError("numbers out of range")
+    targets, thresholds, slopes = calibration.targets, calibration.thresholds, calibration.slopes
+    if not targets.shape == thresholds.shape == slopes.shape:
+        raise ValueError("lists of unequal length")
+    if not (np.diff(targets) > 0).all() or not (np.abs(targets) <= 1).all():
+        raise ValueError("targets out of range")
+    if not model.screens[0] <= model.screens[1]:
+        raise ValueError("screens out of order")
+    arrays = model.views, model.photos, thresholds, slopes
+    if not all((np.abs(array) < LARGEST).all() for array in arrays):
+        raise ValueError("numbers out of range")

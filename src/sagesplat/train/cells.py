@@ -1,0 +1,62 @@
+"""Cells: the compact parts of a category that have levels of their own.
+
+Categories are split by place. Far things are split by direction: coordinates beyond the scene's middle are
+contracted into a ball of twice its radius (Mip-NeRF 360, Eq. 10).
+"""
+
+import numpy as np
+from jaxtyping import Float, Int, Int16
+from scipy.cluster.vq import kmeans2
+
+MOST = 64  # cells of a scene that is split automatically
+FEWEST = 300  # Gaussians of a cell, about, at least
+_OF_ONE = 1500  # Gaussians for each cell in small scenes: of fewer, streams and plans cost more than is saved
+_MIDDLE = 0.8  # share of the Gaussians inside the radius from which on coordinates are contracted
+_SAMPLE = 20_000  # Gaussians of a category that its centres are found from
+
+
+def cells_wanted(count: int) -> int:
+    """Cells of a scene of `count` Gaussians that is split automatically."""
+    return min(MOST, count // _OF_ONE)
+
+
+def split_cells(
+    means: Float[np.ndarray, "N 3"], label_ids: Int16[np.ndarray, " N"], count: int
+) -> tuple[Int16[np.ndarray, " N"], dict[int, int]]:
+    """Split each category into compact cells, about `count` in all; 0: every category is one cell.
+
+    Returns:
+        The cell of each Gaussian, numbered from 0 by category, and the label id of each cell.
+    """
+    labels, column, sizes = np.unique(label_ids, return_inverse=True, return_counts=True)
+    places = contracted(means)
+    cells, label_of = np.empty(len(means), np.int16), dict[int, int]()
+    for number, (label, size) in enumerate(zip(labels.tolist(), sizes.tolist(), strict=True)):
+        rows = np.flatnonzero(column == number)
+        parts = max(min(round(count * size / len(means)), size // FEWEST), 1)
+        nearest = _nearest_centres(places[rows], parts)
+        _, own = np.unique(nearest, return_inverse=True)  # a centre may be nearest to none
+        cells[rows] = len(label_of) + own
+        label_of |= dict.fromkeys(range(len(label_of), len(label_of) + int(own.max()) + 1), label)
+    return cells, label_of
+
+
+def contracted(means: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Positions around the scene's middle, in a ball of radius 2."""
+    if not len(means):
+        return np.zeros((0, 3))
+    centred = means.astype(np.float64) - np.median(means, 0)
+    radius = np.linalg.norm(centred, axis=1)
+    scaled = centred / max(float(np.quantile(radius, _MIDDLE)), 1e-12)
+    far = np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1)
+    return scaled / far * (2 - 1 / far)
+
+
+def _nearest_centres(places: Float[np.ndarray, "n 3"], parts: int) -> Int[np.ndarray, " n"]:
+    """The nearest of `parts` centres found by k-means; the same input gives the same."""
+    if parts == 1:
+        return np.zeros(len(places), np.int64)
+    some = np.linspace(0, len(places) - 1, min(len(places), _SAMPLE)).astype(int)
+    centres, _ = kmeans2(places[some], parts, seed=0, minit="++", missing="warn")
+    squares = [((places - centre) ** 2).sum(1) for centre in centres]
+    return np.argmin(squares, axis=0)
