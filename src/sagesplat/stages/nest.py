@@ -130,7 +130,8 @@ def write_ladder(
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     made = write_streams(
-        job.run.increments, g, sizes, job.names(), second=second, antialiased=job.antialiased
+        job.run.increments, g, sizes, job.names(), label_of={label: label for label in sizes}, second=second,
+        antialiased=job.antialiased,
     )  # fmt: skip
     # what is measured, planned and written from here on is what a viewer gets
     sent, seconds = read_streams(job.run.increments, made.increments)
