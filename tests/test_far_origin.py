@@ -282,7 +282,7 @@ def test_increments_are_ply_where_spz_is_too_coarse(tmp_path):
     g = replace(_ball(), label_ids=torch.zeros(300, dtype=torch.int16))
     g.means[0] = 1e6
     g = replace(g, log_scales=torch.full_like(g.log_scales, -4.0))
-    written = write_increments(tmp_path / "out", g, {0: (100, 300)}, {0: "scene"})
+    written = write_increments(tmp_path / "out", g, {0: (100, 300)}, {0: "scene"}, label_of={0: 0})
     assert [one.format for one in written] == ["ply", "spz"]
     sent = read_increments(tmp_path / "out", read_index(tmp_path / "out"))
     assert (sent.means - g.means).abs().max() < 0.01

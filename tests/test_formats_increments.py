@@ -19,7 +19,7 @@ def test_increments_of_long_and_like_names_are_files_of_their_own(tmp_path):
     g = replace(g, label_ids=torch.arange(12, dtype=torch.int16) % 4)
     names = {0: "🚗" * 100, 1: "Tree", 2: "tree", 3: "x" * 100}
     sizes = dict.fromkeys(names, (1, 3))
-    listed = write_increments(tmp_path / "out", g, sizes, names)
+    listed = write_increments(tmp_path / "out", g, sizes, names, label_of={cell: cell for cell in sizes})
     assert read_index(tmp_path / "out") == listed
     assert len({increment.uri for increment in listed}) == 8
     assert {increment.uri.rsplit("-", 2)[0] for increment in listed} == {
@@ -58,7 +58,8 @@ def test_what_a_level_is_made_of_and_costs_begins_with_the_newest_that_replaces(
     ladder = ladder_of_replacing_levels(tmp_path)
     names = {0: "a", 1: "b", 2: "c"}
     listed = write_increments(
-        tmp_path / "out", ladder.gaussians, SIZES, names, replaces=REPLACES,
+        tmp_path / "out", ladder.gaussians, SIZES, names, label_of={cell: cell for cell in SIZES},
+        replaces=REPLACES,
         kind=lambda label, level: "ply" if label == 2 and level > 1 else "spz",
     )  # fmt: skip
     assert read_index(tmp_path / "out") == listed
@@ -85,7 +86,7 @@ def test_a_level_that_cannot_replace_is_refused(tmp_path, levels):
     g = replace(random_gaussians(9), label_ids=torch.zeros(9, dtype=torch.int16))
     sizes = {0: (1, 4, 4, 9)}
     with pytest.raises(ValueError, match="cannot replace those below"):
-        write_increments(tmp_path / "out", g, sizes, {0: "a"}, replaces={0: levels})
+        write_increments(tmp_path / "out", g, sizes, {0: "a"}, label_of={0: 0}, replaces={0: levels})
     write_set(tmp_path / "ladder.npz", g, 1, sizes, replaces={0: levels})
     with pytest.raises(DataError, match=r"ladder\.npz: impossible replacing levels .*; delete it and run"):
         read_prefixes(tmp_path / "ladder.npz")
@@ -106,7 +107,7 @@ def test_damaged_sizes_and_replacing_levels_are_one_line(tmp_path, array, values
 
 def test_an_index_that_refines_otherwise_is_refused(tmp_path):
     g = replace(random_gaussians(4), label_ids=torch.zeros(4, dtype=torch.int16))
-    write_increments(tmp_path, g, {0: (1, 4)}, {0: "a"}, replaces={0: (2,)})
+    write_increments(tmp_path, g, {0: (1, 4)}, {0: "a"}, label_of={0: 0}, replaces={0: (2,)})
     text = (tmp_path / "index.json").read_text()
     for wrong in ('"SWAP"', "1", "null", '["REPLACE"]'):
         (tmp_path / "index.json").write_text(text.replace('"REPLACE"', wrong))
@@ -120,7 +121,7 @@ def test_files_say_how_they_were_trained(tmp_path, kind):
     g = replace(g, label_ids=torch.zeros(4, dtype=torch.int16))
     for antialiased in (True, False):
         listed = write_increments(
-            tmp_path / "out", g, {0: (4,)}, {0: "a"}, kind=kind, antialiased=antialiased
+            tmp_path / "out", g, {0: (4,)}, {0: "a"}, label_of={0: 0}, kind=kind, antialiased=antialiased
         )
         assert read_splat(tmp_path / "out" / listed[0].uri).antialiased is antialiased
 

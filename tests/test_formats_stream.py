@@ -17,7 +17,7 @@ from make_stream_vectors import DATA, Case, cases
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
-from sagesplat.formats.stream import MAX_COUNT, decode_stream, encode_stream
+from sagesplat.formats.stream import MAX_COUNT, decode_stream, encode_stream, starts_of_streams
 from sagesplat.formats.stream_header import SIZE, Precision
 from tests.conftest import random_gaussians
 from tests.fuzz.mutate import BYTES
@@ -83,6 +83,29 @@ def test_a_cut_after_a_level_is_the_prefix():
             assert found.sizes == coded.sizes[:level]
             assert_equal(found.gaussians, everything.gaussians.slices([slice(0, size)]))
     assert decode_stream(coded.content[:SIZE]).sizes == ()
+
+
+def test_streams_that_lie_one_after_the_other_are_found_without_decoding_them():
+    g = visible()
+    some = [
+        encode_stream(g, SIZES, second=seconds(g)).content,
+        encode_stream(visible(0), [0]).content,
+        encode_stream(visible(20), [20]).content,
+    ]
+    content, starts = b"".join(some), [0, len(some[0]), len(some[0] + some[1])]
+    assert starts_of_streams(content) == starts
+    assert starts_of_streams(content[: starts[2] + SIZE]) == starts
+    assert starts_of_streams(content[: starts[1] - 1]) == [0]
+    assert starts_of_streams(b"") == []
+    for wrong, words in (
+        (content[:-1] + b"\0SGST", "damaged stream"),
+        (some[1] + b"X" * 50, "not a sagesplat-stream"),
+        (content[: starts[1] + 40], "not a sagesplat-stream"),
+        (some[1] + content[:4] + b"\2" + content[5:], "of version 2"),
+        (content[:SIZE] + b"\xff" * 9, "no number"),
+    ):
+        with pytest.raises(DataError, match=words):
+            starts_of_streams(wrong)
 
 
 def test_a_cut_within_a_level_is_an_error():
@@ -162,7 +185,7 @@ def test_second_opacities_of_others_are_refused():
         SecondOpacities(g.logit_opacities, {0: (0.0, 0.5, 1.0)}),
         SecondOpacities(g.logit_opacities, {0: (0.0, 1.0), 1: (0.0, 1.0)}),
     ):
-        with pytest.raises(ValueError, match=r"second opacities|categories"):
+        with pytest.raises(ValueError, match=r"second opacities|cells"):
             encode_stream(g, [2, 5], second=second)
     with pytest.raises(DataError, match="second opacities"):
         encode_stream(g, [2, 5], second=SecondOpacities(g.logit_opacities * torch.nan, {0: (0.0, 1.0)}))
@@ -234,7 +257,7 @@ def test_a_precision_that_the_format_does_not_have(wrong: dict[str, Any]):
     ("at", "value", "words"),
     [
         (0, b"X", "not a sagesplat-stream"),
-        (4, b"\1", "a stream of version 1, and not 2; use the version of sagesplat that wrote it"),
+        (4, b"\2", "a stream of version 2, and not 3; use the version of sagesplat that wrote it"),
         (5, b"\4", "unknown flags 4"),
         (7, b"\0", "0 levels"),
         (24, b"\0\0\xc0\x7f", "impossible steps"),

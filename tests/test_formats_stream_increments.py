@@ -20,6 +20,8 @@ from sagesplat.io.typed import convert_as
 SIZES = {0: (3, 3, 10, 20, 20), 2: (0, 4, 6, 6, 15), 5: (1, 2, 2, 2, 2)}
 NAMES = {0: "grass", 2: "car", 5: "sky"}
 WEIGHTS = (0.0, 0.0, 0.2, 0.6, 1.0)
+ALONE = {0: 0, 2: 2, 5: 5}  # each category is one cell
+CELLS = {0: 7, 5: 7, 2: 9}
 
 
 def some() -> tuple[Gaussians, SecondOpacities]:
@@ -35,7 +37,7 @@ def some() -> tuple[Gaussians, SecondOpacities]:
 @pytest.fixture
 def written(tmp_path: Path) -> Streams:
     g, second = some()
-    return write_streams(tmp_path, g, SIZES, NAMES, second=second)
+    return write_streams(tmp_path, g, SIZES, NAMES, label_of=ALONE, second=second)
 
 
 def test_increments_are_ranges_that_fill_the_file_of_their_category(tmp_path, written):
@@ -99,22 +101,64 @@ def test_the_ladder_has_both_opacities_of_what_was_written(tmp_path, written):
 
 def test_without_second_opacities_the_index_has_no_weights(tmp_path):
     g, _ = some()
-    made = write_streams(tmp_path, g, SIZES, NAMES)
+    made = write_streams(tmp_path, g, SIZES, NAMES, label_of=ALONE)
     index = json.loads((tmp_path / "index.json").read_text())
     assert index["format"] == "stream"
-    usual = {"label_id", "level", "uri", "count", "nbytes", "gpu_bytes", "sha256"}
+    usual = {"label_id", "cell", "level", "uri", "count", "nbytes", "gpu_bytes", "sha256"}
     assert [set(one) - usual for one in index["chunks"][:2]] == [set(), {"offset"}]
     assert read_streams(tmp_path, made.increments)[1] is None
-    assert write_streams(tmp_path, g, SIZES, NAMES).increments == made.increments
+    assert write_streams(tmp_path, g, SIZES, NAMES, label_of=ALONE).increments == made.increments
     assert 5 in made.sizes
 
 
 def test_a_category_that_nobody_sees_has_no_stream(tmp_path):
     g, _ = some()
     g.logit_opacities[g.label_ids == 2] = -9.0
-    made = write_streams(tmp_path, g, SIZES, NAMES)
+    made = write_streams(tmp_path, g, SIZES, NAMES, label_of=ALONE)
     assert set(made.sizes) == {0, 5}
     assert not list(tmp_path.glob("car*"))
+
+
+def test_cells_of_a_category_share_a_file_and_each_is_read_without_the_others(tmp_path):
+    g, second = some()
+    made = write_streams(tmp_path, g, SIZES, {7: "grass", 9: "sky"}, label_of=CELLS, second=second)
+    assert read_index(tmp_path) == made.increments
+    assert [(one.label_id, one.cell, one.level, one.count) for one in made.increments] == [
+        (7, 0, 1, 3), (7, 0, 3, 7), (7, 0, 4, 10), (7, 5, 1, 1), (9, 2, 2, 4), (9, 2, 3, 2), (9, 2, 5, 9),
+    ]  # fmt: skip
+    assert made.sizes == {0: SIZES[0], 5: (1, 1, 1, 1, 1), 2: SIZES[2]}
+    grass = next(tmp_path.glob("grass-*.sgst"))
+    content = grass.read_bytes()
+    assert len(list(tmp_path.glob("*.sgst"))) == 2
+    ranges = [(one.offset, one.nbytes) for one in made.increments if one.uri == grass.name]
+    assert [low + count for low, count in ranges] == [low for low, _ in ranges[1:]] + [len(content)]
+
+    everything, rows = read_increments(tmp_path, full_scene(made.increments)), torch.from_numpy(made.rows)
+    assert torch.equal(everything.label_ids, g.label_ids[rows])
+    assert read_streams(tmp_path, made.increments)[1].weights.keys() == {0, 2, 5}
+    named = read_increments(tmp_path, made.increments, by_category=True)
+    assert named.counts() == {7: 21, 9: 15}
+
+    for cell in (0, 5):  # whatever another cell has for levels, or has lost
+        grass.write_bytes(content if cell == 5 else content[: ranges[3][0]])
+        for level in range(1, 6):
+            found = read_increments(tmp_path, shown(made.increments, cell, level))
+            mine = everything.means[everything.label_ids == cell]
+            assert torch.equal(found.means, mine[: made.sizes[cell][level - 1]])
+    assert totals(made.increments, [0, 2, 5], 5, "count").tolist() == [
+        list(made.sizes[cell]) for cell in (0, 2, 5)
+    ]
+
+
+def test_cells_cost_a_few_bytes_more_than_the_category(tmp_path):
+    g = random_gaussians(6000, degree=1, logit=3)
+    g = replace(g, label_ids=(torch.arange(6000) % 3).short(), shN=g.shN * (g.shN.abs() > 0.2))
+    sizes = dict.fromkeys(range(3), (40, 200, 1000, 2000))
+    cells = write_streams(tmp_path, g, sizes, {}, label_of=dict.fromkeys(sizes, 0)).increments
+    one = replace(g, label_ids=torch.zeros_like(g.label_ids))
+    whole = write_streams(tmp_path, one, {0: (120, 600, 3000, 6000)}, {}, label_of={0: 0}).increments
+    assert sum(c.nbytes for c in cells) < 1.04 * sum(c.nbytes for c in whole)
+    assert len({c.uri for c in cells}) == 1
 
 
 def test_damage_is_one_line(tmp_path, written):
@@ -144,7 +188,7 @@ def test_damage_is_one_line(tmp_path, written):
      {"weight": float("nan")}, {"weight": True}, {"uri": "a-01-x.spz", "offset": 4}],
 )  # fmt: skip
 def test_impossible_entries(wrong):
-    good = Increment(0, 1, "a-x.sgst", 3, 40, 120, "0" * 64, offset=4, weight=0.5)
+    good = Increment(0, 7, 1, "a-x.sgst", 3, 40, 120, "0" * 64, offset=4, weight=0.5)
     assert convert_as(asdict(good), Increment) == good
     with pytest.raises(ValueError, match=r"offset|weight"):
         convert_as({**asdict(good), **wrong}, Increment)

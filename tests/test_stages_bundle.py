@@ -323,7 +323,7 @@ def test_a_run_with_levels_that_replace(run: Path, tmp_path: Path, viewer: Path)
     level = next(k for k in range(3, 1 + len(ends)) if ends[k - 1] > ends[k - 2])
     replaces = {label: (level,)}
     chunks = write_increments(
-        job.run.increments, g, sizes, job.names(), replaces=replaces,
+        job.run.increments, g, sizes, job.names(), label_of={i: i for i in sizes}, replaces=replaces,
         kind=lambda i, k: "ply" if i == label and k >= level else "spz",
     )  # fmt: skip
     sent = read_increments(job.run.increments, chunks)

@@ -283,7 +283,9 @@ def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
     sizes = {0: (1, 5, 20), 1: (2, 2, 20), 2: (20, 20, 20)}
     g = ordered().gaussians
     g = g.select(torch.from_numpy(packed(g, sizes)))
-    chunks = write_increments(tmp_path / "chunks", g, sizes, {0: "a b", 1: "c", 2: "d"})
+    chunks = write_increments(
+        tmp_path / "chunks", g, sizes, {0: "a b", 1: "c", 2: "d"}, label_of={0: 0, 1: 1, 2: 2}
+    )
     assert [(c.label_id, c.level, c.count) for c in chunks] == [
         (0, 1, 1), (0, 2, 4), (0, 3, 15), (1, 1, 2), (1, 3, 18), (2, 1, 20)
     ]  # fmt: skip
@@ -295,9 +297,13 @@ def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
     assert torch.equal(sent.label_ids, g.label_ids)
     np.testing.assert_allclose(sent.means, g.means, atol=0.02)
     np.testing.assert_allclose(totals(chunks, [0, 1, 2], 3, "count"), list(sizes.values()))
-    again = write_increments(tmp_path / "again", g, sizes, {0: "a b", 1: "c", 2: "d"})
+    again = write_increments(
+        tmp_path / "again", g, sizes, {0: "a b", 1: "c", 2: "d"}, label_of={0: 0, 1: 1, 2: 2}
+    )
     assert again == chunks  # their names are hashes of their bytes
-    plain = write_increments(tmp_path / "plys", g, sizes, {0: "a b", 1: "c", 2: "d"}, kind="ply")
+    plain = write_increments(
+        tmp_path / "plys", g, sizes, {0: "a b", 1: "c", 2: "d"}, label_of={0: 0, 1: 1, 2: 2}, kind="ply"
+    )
     part = read_ply(tmp_path / "plys" / plain[1].uri)
     np.testing.assert_array_equal(part.means, g.means[1:5])
     (tmp_path / "chunks" / "index.json").write_text('{"chunks": [{"label_id": 0}]}')
@@ -497,6 +503,6 @@ def test_one_gaussian_is_a_category_too(tmp_path: Path) -> None:
     g = ordered().gaussians.select(torch.tensor([0, 20, 21]))
     sizes = {label: level_sizes(n, QUICK) for label, n in g.counts().items()}
     assert sizes[0] == (1, 1, 1, 1)
-    chunks = write_increments(tmp_path / "chunks", g, sizes, {0: "a", 1: "b"})
+    chunks = write_increments(tmp_path / "chunks", g, sizes, {0: "a", 1: "b"}, label_of={0: 0, 1: 1})
     assert [(c.label_id, c.level) for c in chunks] == [(0, 1), (1, 1), (1, 4)]
     assert totals(chunks, [0, 1], 4, "count").tolist() == [[1, 1, 1, 1], [1, 1, 1, 2]]

@@ -125,7 +125,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def three_walls(folder: Path, **increments: Any) -> Contents:
     g = cloud()
-    chunks = write_increments(folder / "chunks", g, SIZES, NAMES, **increments)
+    chunks = write_increments(
+        folder / "chunks", g, SIZES, NAMES, label_of=dict(zip(SIZES, SIZES, strict=True)), **increments
+    )
     places = {i: g.means[g.label_ids == i].numpy() * [1, -1, -1] for i in NAMES}
     categories = [
         Category(i, name, name.split("-")[0], "#" + bytes(int(255 * c) for c in COLOURS[i]).hex(),
@@ -278,7 +280,16 @@ def test_the_picture_is_the_rasterizers(viewer: Opened, made: Path) -> None:
     shown = settled(viewer)
     labels = json.loads((made / "manifest.json").read_text())["labels"]
     listed = [
-        Increment(label["id"], k, Path(e["uri"]).name, e["count"], e["bytes"], e["gpuBytes"], e["sha256"])
+        Increment(
+            label["id"],
+            label["id"],
+            k,
+            Path(e["uri"]).name,
+            e["count"],
+            e["bytes"],
+            e["gpuBytes"],
+            e["sha256"],
+        )
         for label in labels
         for k, e in enumerate(label["levels"], 1)
     ]
@@ -307,7 +318,9 @@ def test_streams_are_drawn_as_the_rasterizer_draws_each_of_their_levels(browser,
     """Also with two opacities, on the way up and down: what is drawn depends on the newest level."""
     g = cloud()
     second = SecondOpacities(g.logit_opacities - 3, dict.fromkeys(NAMES, (0.0, 0.0, 0.4, 1.0)))
-    streams = write_streams(tmp_path / "streams", g, SIZES, NAMES, second=second)
+    streams = write_streams(
+        tmp_path / "streams", g, SIZES, NAMES, label_of=dict(zip(SIZES, SIZES, strict=True)), second=second
+    )
     contents = replace(three_walls(tmp_path), chunks=streams.increments, folder=tmp_path / "streams")
     ladder, kept = read_streams(contents.folder, contents.chunks)
     assert kept is not None

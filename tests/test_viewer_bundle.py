@@ -342,7 +342,7 @@ def viewer(tmp_path: Path) -> Path:
 @pytest.fixture
 def contents(tmp_path: Path) -> Contents:
     """Three categories of three levels, one of them with models."""
-    chunks = write_increments(tmp_path / "chunks", G, SIZES, NAMES)
+    chunks = write_increments(tmp_path / "chunks", G, SIZES, NAMES, label_of={i: i for i in SIZES})
     made = replace(model(3, 6, [1, 2, 3]), label_id=3)
     fidelity = replace(model(4, 5, [1, 2, 3], quality="fidelity"), label_id=3)
     entries = [
@@ -470,7 +470,7 @@ def test_the_page_names_the_pack(tmp_path, contents, viewer) -> None:
 
 def test_levels_that_replace_are_in_the_manifest(tmp_path, contents, viewer) -> None:
     chunks = write_increments(
-        tmp_path / "chunks", G, SIZES, NAMES, replaces={3: (3,)},
+        tmp_path / "chunks", G, SIZES, NAMES, label_of={i: i for i in SIZES}, replaces={3: (3,)},
         kind=lambda label, level: "ply" if label == 3 and level == 3 else "spz",
     )  # fmt: skip
     written = write_bundle(tmp_path / "out", replace(contents, chunks=chunks), viewer)
@@ -489,7 +489,7 @@ def test_levels_that_replace_are_in_the_manifest(tmp_path, contents, viewer) -> 
 def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewer) -> None:
     g = replace(random_gaussians(39, degree=1, logit=3), label_ids=G.label_ids)
     second = SecondOpacities(g.logit_opacities - 1, dict.fromkeys(SIZES, (0.0, 0.5, 1.0)))
-    made = write_streams(tmp_path / "chunks", g, SIZES, NAMES, second=second)
+    made = write_streams(tmp_path / "chunks", g, SIZES, NAMES, label_of={i: i for i in SIZES}, second=second)
     written = write_bundle(tmp_path / "out", replace(contents, chunks=made.increments), viewer)
     manifest = manifest_of(tmp_path / "out")
     listed = [level for label in manifest["labels"] for level in label["levels"]]

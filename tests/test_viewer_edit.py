@@ -37,7 +37,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     g = cloud()
     white = ((g.label_ids == 2) & (g.means[:, 0] < 0))[:, None, None]
     g = replace(g, sh0=g.sh0.masked_fill(white, 1.7))
-    made = write_streams(folder / "streams", g, SIZES, NAMES)
+    made = write_streams(folder / "streams", g, SIZES, NAMES, label_of={i: i for i in SIZES})
     contents = replace(
         contents,
         categories=[

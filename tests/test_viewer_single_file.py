@@ -50,7 +50,9 @@ def viewer(tmp_path: Path) -> Path:
 def contents(tmp_path: Path) -> Contents:
     g = random_gaussians(30, degree=1).select(torch.arange(30))
     sizes = {label: (2, n) for label, n in g.counts().items()}
-    chunks = write_increments(tmp_path / "chunks", g, sizes, {3: "car", 184: "tree"})
+    chunks = write_increments(
+        tmp_path / "chunks", g, sizes, {3: "car", 184: "tree"}, label_of={3: 3, 184: 184}
+    )
     unit = torch.tensor([[-1.0, -1, -1, 1, 1, 1]]).numpy()
     categories = [Category(i, f"c{i}", f"c{i}", "#808080", unit) for i in sizes]
     return Contents(

@@ -1,8 +1,8 @@
-"""Increments of nested levels: the Gaussians that a level of a category adds to the level below it.
+"""Increments of nested levels: the Gaussians that a level of a cell adds to the level below it.
 
-Those of a category are ranges of one coded stream, or files of their own (SPZ, PLY). A level may replace
-those below it (`refine: REPLACE`, as in 3D Tiles): a category then shows the increments from the newest such
-level on, and not the ones below.
+A cell is a category, or a part of one in space. Increments are ranges of coded streams, which are in one file
+for each category, or files of their own (SPZ, PLY). A level may replace those below it (`refine: REPLACE`, as
+in 3D Tiles): a cell then shows the increments from the newest such level on, and not the ones below.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import put_ply, read_ply
 from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, position_step, read_spz
-from sagesplat.formats.stream import Decoded, decode_stream
+from sagesplat.formats.stream import Decoded, decode_stream, starts_of_streams
 from sagesplat.io.files import atomic_folder, write_json
 from sagesplat.io.typed import read_json_as
 
@@ -42,9 +42,10 @@ GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
 
 @dataclass(frozen=True)
 class Increment:
-    """The Gaussians that a level of a category adds to the level below it, or replaces it by, as bytes."""
+    """The Gaussians that a level of a cell adds to the level below it, or replaces it by, as bytes."""
 
-    label_id: LabelId
+    label_id: LabelId  # of its category
+    cell: LabelId
     level: AtLeast1
     uri: str  # a file name in the folder of the index; its name holds a hash, so it can be cached for ever
     count: AtLeast1  # Gaussians
@@ -52,7 +53,7 @@ class Increment:
     gpu_bytes: AtLeast1
     sha256: Sha256
     refine: Refine = "ADD"  # REPLACE: instead of all increments of lower levels
-    offset: Count = 0  # its first byte in the file: a coded stream has all levels of a category
+    offset: Count = 0  # its first byte in the file, which has all coded streams of a category
     weight: Share | None = None  # of second opacities where this is the newest level; None: there are none
 
     def __post_init__(self) -> None:
@@ -68,22 +69,22 @@ class Increment:
 
 
 def packed(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> Int64[np.ndarray, " N"]:
-    """Rows sorted by category and level, and within a level, where any order is valid, by `packing_order`."""
+    """Rows sorted by cell and level, and within a level, where any order is valid, by `packing_order`."""
     rows = [part[packing_order(g.select(torch.from_numpy(part)))] for _, _, part in increments(g, sizes)]
     return np.concatenate([*rows, np.arange(0)])
 
 
 def increments(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> list[tuple[int, int, np.ndarray]]:
-    """(label id, level, added rows) of every level that adds Gaussians.
+    """(cell id, level, added rows) of every level that adds Gaussians.
 
-    `sizes`: by label id, the number of Gaussians in each level.
+    `sizes`: by cell id, which `g.label_ids` are, the number of Gaussians in each level.
     """
-    labels, added = g.label_ids.numpy(), []
-    for label in sorted(sizes):
-        rows = np.flatnonzero(labels == label)
-        for level, (low, high) in enumerate(pairwise((0, *sizes[label])), 1):
+    cells, added = g.label_ids.numpy(), []
+    for cell in sorted(sizes):
+        rows = np.flatnonzero(cells == cell)
+        for level, (low, high) in enumerate(pairwise((0, *sizes[cell])), 1):
             if high > low:
-                added.append((label, level, rows[low:high]))
+                added.append((cell, level, rows[low:high]))
     return added
 
 
@@ -93,6 +94,7 @@ def write_increments(
     sizes: Mapping[int, Sequence[int]],
     names: dict[int, str],
     *,
+    label_of: Mapping[int, int],
     replaces: Mapping[int, Collection[int]] | None = None,
     kind: FileFormat | Callable[[int, int], FileFormat] = "spz",
     fine: Collection[int] = (),
@@ -100,22 +102,23 @@ def write_increments(
 ) -> list[Increment]:
     """Write the increments of nested levels as files, and their index; `folder` is replaced.
 
-    `sizes`: by label id, the rows up to the end of each level. `names`: label id -> category. `replaces`: by
-    label id, the levels that replace those below (`formats.levels.starts_of`). `kind`: of all files, or of a
-    label id and level. `antialiased` as in `encode_spz`; the levels `fine` are rounded by the smallest steps
-    of the format. Where SPZ's steps of positions are larger than most Gaussians, a file is a PLY.
+    `sizes`: by cell id, which `g.label_ids` are, the rows up to the end of each level. `names`: label id ->
+    category. `label_of`: cell id -> label id. `replaces`: by cell id, the levels that replace those below
+    (`formats.levels.starts_of`). `kind`: of all files, or of a cell id and level. `antialiased` as in
+    `encode_spz`; the levels `fine` are rounded by the smallest steps of the format. Where SPZ's steps of
+    positions are larger than most Gaussians, a file is a PLY.
 
     ValueError for levels that cannot replace.
     """
     replaces, written = replaces or {}, []
-    for label, levels in replaces.items():
-        starts_of(sizes[label], levels)  # what cannot replace is an error, not an increment lost
-    kind_of = kind if callable(kind) else lambda label, level: kind
-    stems = slugs({label: names.get(label, str(label)) for label in sizes})
+    for cell, levels in replaces.items():
+        starts_of(sizes[cell], levels)  # what cannot replace is an error, not an increment lost
+    kind_of = kind if callable(kind) else lambda cell, level: kind
+    stems = slugs({cell: names.get(label, str(label)) for cell, label in label_of.items()})
     with atomic_folder(folder) as fresh:
-        for label, level, rows in increments(g, sizes):
+        for cell, level, rows in increments(g, sizes):
             part = g.select(torch.from_numpy(rows))
-            suffix = kind_of(label, level)
+            suffix = kind_of(cell, level)
             if suffix == "spz" and np.greater(*position_step(part)):
                 suffix = "ply"  # some lie so far off that SPZ's steps are larger than the others
             temporary = fresh / f"increment.{suffix}"
@@ -128,11 +131,13 @@ def write_increments(
                 put_ply(temporary, part, antialiased=antialiased)
             content = temporary.read_bytes()
             digest = hashlib.sha256(content).hexdigest()
-            uri = f"{stems[label]}-{level:02d}-{digest[:12]}.{suffix}"
+            uri = f"{stems[cell]}-{level:02d}-{digest[:12]}.{suffix}"
             temporary.rename(fresh / uri)
             gpu = len(part) * GPU_BYTES[part.sh_degree]
-            refine: Refine = "REPLACE" if level in replaces.get(label, ()) else "ADD"
-            written.append(Increment(label, level, uri, len(part), len(content), gpu, digest, refine))
+            refine: Refine = "REPLACE" if level in replaces.get(cell, ()) else "ADD"
+            written.append(
+                Increment(label_of[cell], cell, level, uri, len(part), len(content), gpu, digest, refine)
+            )
         write_index(fresh, written)
     return written
 
@@ -155,41 +160,46 @@ def read_index(folder: Path) -> list[Increment]:
     return read_json_as(folder / INDEX, _Index, "an index of increments", _CURE).chunks
 
 
-def read_increments(folder: Path, listed: Sequence[Increment]) -> Gaussians:
-    """The Gaussians of increments, concatenated, as the newest of them shows each category.
+def read_increments(folder: Path, listed: Sequence[Increment], *, by_category: bool = False) -> Gaussians:
+    """The Gaussians of increments, concatenated, as the newest of them shows each cell.
 
-    DataError for a missing or damaged file.
+    Their `label_ids` are cell ids, or those of categories. DataError for a missing or damaged file.
     """
     parts = []
     for some in by_file(folder, listed):
         if some[0].format == "stream":
             decoded = stream_of(folder, some)
-            parts.append(decoded.shown().slices([_rows(folder, decoded, one) for one in some]))
+            part = decoded.shown().slices([_rows(folder, decoded, one) for one in some])
         else:
-            parts += [_read(folder, increment) for increment in some]
+            part = concat([_read(folder, increment) for increment in some])
+        if by_category:
+            part = replace(part, label_ids=torch.full_like(part.label_ids, some[0].label_id))
+        parts.append(part)
     return concat(parts)
 
 
 def by_file(folder: Path, listed: Sequence[Increment]) -> list[list[Increment]]:
-    """Increments that lie one after the other in one file; DataError without any."""
+    """Increments of a cell that lie one after the other in one file; DataError without any."""
     if not listed:
         raise DataError(f"{folder}: no increments; {_CURE}")
-    return [list(some) for _, some in groupby(listed, key=lambda one: one.uri)]
+    return [list(some) for _, some in groupby(listed, key=lambda one: (one.uri, one.cell))]
 
 
 def stream_of(folder: Path, some: Sequence[Increment]) -> Decoded:
-    """The stream that increments are in, up to the newest of them."""
+    """The stream that increments of a cell are in, up to the newest of them; `ends` are bytes of the file."""
     path, end = folder / some[0].uri, max(one.offset + one.nbytes for one in some)
     try:
         content = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from None
-    return decode_stream(content[:end], label_id=some[0].label_id, name=str(path))
+    start = max(at for at in starts_of_streams(content, name=str(path)) if at <= some[0].offset)
+    decoded = decode_stream(content[start:end], label_id=some[0].cell, name=str(path))
+    return replace(decoded, start=start, ends=tuple(start + at for at in decoded.ends))
 
 
 def _rows(folder: Path, decoded: Decoded, one: Increment) -> slice:
     """The rows of an increment in what its stream was decoded to."""
-    at = dict(zip((0, *decoded.ends), (0, *decoded.sizes), strict=True))
+    at = dict(zip((decoded.start, *decoded.ends), (0, *decoded.sizes), strict=True))
     low, high = at.get(one.offset, -1), at.get(one.offset + one.nbytes, -1)
     if low < 0 or high - low != one.count:
         raise DataError(f"{folder / one.uri}: other levels than the index has; {_CURE}")
@@ -198,41 +208,40 @@ def _rows(folder: Path, decoded: Decoded, one: Increment) -> slice:
 
 def _read(folder: Path, increment: Increment) -> Gaussians:
     if increment.format == "spz":
-        return read_spz(folder / increment.uri, increment.label_id)
+        return read_spz(folder / increment.uri, increment.cell)
     g = read_ply(folder / increment.uri)
-    return replace(g, label_ids=torch.full_like(g.label_ids, increment.label_id))
+    return replace(g, label_ids=torch.full_like(g.label_ids, increment.cell))
 
 
-def shown(listed: Sequence[Increment], label_id: int, level: int) -> list[Increment]:
-    """The increments that make up a level of a category, ascending: since the newest REPLACE."""
-    mine = (c for c in listed if c.label_id == label_id and c.level <= level)
+def shown(listed: Sequence[Increment], cell: int, level: int) -> list[Increment]:
+    """The increments that make up a level of a cell, ascending: since the newest REPLACE."""
+    mine = (c for c in listed if c.cell == cell and c.level <= level)
     return full_scene(sorted(mine, key=lambda c: c.level))
 
 
 def full_scene(listed: Sequence[Increment]) -> list[Increment]:
-    """The increments that make up the highest level of every category, in their order."""
+    """The increments that make up the highest level of every cell, in their order."""
     newest: dict[int, int] = {}
     for one in listed:
         if one.refine == "REPLACE":
-            newest[one.label_id] = max(newest.get(one.label_id, 0), one.level)
-    return [one for one in listed if one.level >= newest.get(one.label_id, 0)]
+            newest[one.cell] = max(newest.get(one.cell, 0), one.level)
+    return [one for one in listed if one.level >= newest.get(one.cell, 0)]
 
 
-def totals(listed: Sequence[Increment], labels: Sequence[int], levels: int, what: str) -> np.ndarray:
-    """Sums of a field over the increments that make up each level: int64 [L, K].
+def totals(listed: Sequence[Increment], cells: Sequence[int], levels: int, what: str) -> np.ndarray:
+    """Sums of a field over the increments that make up each level: int64 [C, K].
 
-    Rows are `labels`, columns the levels 1 to K; `what` is count, nbytes or gpu_bytes. DataError for an
-    increment of another category or level.
+    Rows are `cells`, columns the levels 1 to K; `what` is count, nbytes or gpu_bytes. DataError for an
+    increment of another cell or level.
     """
-    table, replaced = np.zeros((2, len(labels), levels), np.int64)
-    row = {label: i for i, label in enumerate(labels)}
+    table, replaced = np.zeros((2, len(cells), levels), np.int64)
+    row = {cell: i for i, cell in enumerate(cells)}
     for increment in listed:
-        if increment.label_id not in row or increment.level > levels:
+        if increment.cell not in row or increment.level > levels:
             raise DataError(
-                f"{increment.uri}: this run has no category {increment.label_id}, level {increment.level}; "
-                f"{_CURE}"
+                f"{increment.uri}: this run has no cell {increment.cell}, level {increment.level}; {_CURE}"
             )
-        at = row[increment.label_id], increment.level - 1
+        at = row[increment.cell], increment.level - 1
         table[at] += getattr(increment, what)
         replaced[at] |= increment.refine == "REPLACE"
     ends = table.cumsum(1)

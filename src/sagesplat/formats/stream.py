@@ -1,8 +1,9 @@
-"""`sagesplat-stream`: the nested levels of one category as coded bytes that can be cut after any level.
+"""`sagesplat-stream`: the nested levels of one cell as coded bytes that can be cut after any level.
 
 A header of 44 bytes, then the levels: the number of their Gaussians, the number of their bytes, with two
 opacities the weight of the second one, and their columns of integers, coded by an adaptive rANS. The second
 opacities of levels of weight 0 come with the first level that needs them.
+A file has the streams of all cells of a category, one after the other; none of them needs another one.
 docs/formats.md specifies all of it.
 """
 
@@ -30,6 +31,7 @@ from sagesplat.formats.stream_columns import (
 )
 from sagesplat.formats.stream_header import (
     SIZE,
+    Header,
     OtherVersionError,
     Precision,
     header_of,
@@ -69,6 +71,7 @@ class Decoded:
     ends: tuple[int, ...]  # bytes up to the end of each level
     sizes: tuple[int, ...]  # Gaussians up to the end of each level
     antialiased: bool  # how the scene was trained
+    start: int = 0  # its first byte
 
     def shown(self) -> Gaussians:
         """The Gaussians with their opacities at the newest of these levels."""
@@ -94,9 +97,9 @@ def encode_stream(
     (`Precision.least`). The same input gives the same bytes.
 
     Args:
-        g: The Gaussians of one category in the order of their levels, on any device.
+        g: The Gaussians of one cell in the order of their levels, on any device.
         sizes: The number of Gaussians up to the end of each level, ascending, the last one N.
-        second: Their second opacities, with the weights of this one category, which are rounded to 1/255. At
+        second: Their second opacities, with the weights of this one cell, which are rounded to 1/255. At
             levels of weight 1 they are the only ones. Levels that show the same Gaussians get one weight,
             that of the last.
         precision: Steps of quantisation. Finer ones than a model was trained with waste bytes.
@@ -161,7 +164,7 @@ def encode_stream(
 def _weights(second: SecondOpacities) -> tuple[float, ...]:
     """Of each level; ValueError for those of several categories."""
     if len(second.weights) != 1:
-        raise ValueError(f"weights of {len(second.weights)} categories; a stream has one")
+        raise ValueError(f"weights of {len(second.weights)} cells; a stream has one")
     (weights,) = second.weights.values()
     return weights
 
@@ -184,7 +187,7 @@ def decode_stream(
     Args:
         content: The bytes, up to the end of any level.
         levels: How many levels to decode, at least 1. None: those that `content` has.
-        label_id: Category of all Gaussians.
+        label_id: What all Gaussians get.
         name: What errors call the stream.
 
     Returns:
@@ -204,10 +207,8 @@ def decode_stream(
         while len(sizes) <= (levels or header.levels):
             if levels is None and at == len(content):
                 break
-            count, at = _read_leb128(content, at)
-            nbytes, at = _read_leb128(content, at)
-            weights += content[at : at + 1] if header.two_opacities else [255]
-            at += header.two_opacities
+            count, nbytes, at = _read_sizes(content, at, header)
+            weights += content[at - 1 : at] if header.two_opacities else [255]
             if nbytes > len(content) - at or count > min(MAX_COUNT - sizes[-1], _PER_BYTE * nbytes):
                 raise ValueError(f"{count} Gaussians in {nbytes} of {len(content) - at} bytes")
             reader = _reader(tables, content[at : at + nbytes], count)
@@ -224,19 +225,43 @@ def decode_stream(
             sizes.append(sizes[-1] + count)
         if len(sizes) == header.levels + 1 and at != len(content):
             raise ValueError(f"{len(content) - at} bytes after the last level")
-    except OtherVersionError as error:
-        raise DataError(
-            f"{name}: {error}; use the version of sagesplat that wrote it, or delete its folder and repeat "
-            "the run from `sagesplat nest RUN` on"
-        ) from None
     except ValueError as error:
-        raise DataError(f"{name}: a damaged stream ({short(error)}); copy it again") from None
+        raise _damaged(name, error) from None
     columns, second = joined(parts, header.sh_degree), None
     if header.two_opacities:
         logits = logits_of(columns.seconds, header.opacity_step)
         second = SecondOpacities(logits, {label_id: tuple(w / 255 for w in weights)})
     g = restored(columns, header, label_id)
     return Decoded(g, second, tuple(ends), tuple(sizes[1:]), header.antialiased)
+
+
+def starts_of_streams(content: bytes, *, name: str = "streams") -> list[int]:
+    """The first byte of each of the streams that lie one after the other, of which the last may be cut off.
+
+    DataError for another format or version, or damage.
+    """
+    starts, at = [], 0
+    try:
+        while at < len(content):
+            starts.append(at)
+            header = read_header(content[at : at + SIZE])
+            at += SIZE
+            for _ in range(header.levels):
+                if at < len(content):
+                    _, nbytes, at = _read_sizes(content, at, header)
+                    at += nbytes
+    except ValueError as error:
+        raise _damaged(name, error) from None
+    return starts
+
+
+def _damaged(name: str, error: ValueError) -> DataError:
+    if isinstance(error, OtherVersionError):
+        return DataError(
+            f"{name}: {error}; use the version of sagesplat that wrote it, or delete its folder and repeat "
+            "the run from `sagesplat nest RUN` on"
+        )
+    return DataError(f"{name}: a damaged stream ({short(error)}); copy it again")
 
 
 def _check(name: str, g: Gaussians, sizes: Sequence[int], second: SecondOpacities | None) -> None:
@@ -309,6 +334,13 @@ def _leb128(value: int) -> bytes:
         content.append(value & 127 | 128)
         value >>= 7
     return bytes([*content, value])
+
+
+def _read_sizes(content: bytes, at: int, header: Header) -> tuple[int, int, int]:
+    """Gaussians of a level, bytes of its payload, where that begins; ValueError where they are missing."""
+    count, at = _read_leb128(content, at)
+    nbytes, at = _read_leb128(content, at)
+    return count, nbytes, at + header.two_opacities
 
 
 def _read_leb128(content: bytes, at: int) -> tuple[int, int]:

@@ -25,6 +25,7 @@ _OPACITIES = 256
 _CLASSES = 4  # of first opacities: rows of the table of second ones
 _PEAK = 512
 _FLAT = 128
+_LIKELY = 64  # count of an opacity that is not the largest
 
 
 @dataclass(frozen=True)
@@ -74,17 +75,20 @@ def new_tables(layout: Layout) -> dict[str, np.ndarray]:
     """Counts that a stream begins with, by name: int [contexts, symbols]."""
     opacities = np.arange(_OPACITIES)
     possible = (opacities >= (not layout.two_opacities)) & (opacities <= layout.opacities)
+    most = opacities == layout.opacities
+    flat = np.where(possible, _LIKELY, 0)
+    opaque = np.where(most, _PEAK, flat)  # many are opaque, above all those that stay so
     tables = {
-        "gap": _peaked(_GAPS, 24, 4)[None],
-        "opacity": np.where(possible, _FLAT, 0)[None],
-        "second opacity": np.tile(np.where(possible, _FLAT, 0), (_CLASSES, 1)),
-        "scale": np.stack([_peaked(_SCALES, _SCALE, 12), *[_peaked(_SCALES, 9, 6)] * 2]),
+        "gap": _peaked(_GAPS, 18, 3)[None],
+        "opacity": opaque[None],
+        "second opacity": np.stack([*[flat] * (_CLASSES - 1), opaque]),
+        "scale": np.stack([_peaked(_SCALES, _SCALE, 5), *[_peaked(_SCALES, 5, 5)] * 2]),
         "rotation": np.stack([_within(steps) for steps in ROTATIONS]),
-        "colour": np.stack([_peaked(_COLOURS, _COLOUR, 12), *[_peaked(_COLOURS, _COLOUR, 4)] * 2]),
+        "colour": np.stack([_peaked(_COLOURS, _COLOUR, 10), *[_peaked(_COLOURS, _COLOUR, 5)] * 2]),
     }
     for degree in range(1, layout.sh_degree + 1):
         low, high = BASES[degree - 1 : degree + 1]
-        tables[f"mask {degree}"] = np.tile(_few(high - low), (low + 1, 1))
+        tables[f"mask {degree}"] = np.stack([_few(high - low, max(4 - n, 2)) for n in range(low + 1)])
         for name, contexts in (("green", 1), ("red", 7), ("blue", 15)):
             tables[f"{name} {degree}"] = np.tile(_peaked(_HARMONICS, _HARMONIC, 0.5), (contexts, 1))
     return tables
@@ -101,10 +105,10 @@ def _within(steps: int) -> np.ndarray:
     return np.where(np.abs(np.arange(2 * _ROTATION + 1) - _ROTATION) <= steps, _FLAT, 0)
 
 
-def _few(bits: int) -> np.ndarray:
-    """Counts of masks: a quarter for each bit that is set, at least 1."""
+def _few(bits: int, halvings: int) -> np.ndarray:
+    """Counts of masks, halved as often for each bit that is set, at least 1."""
     ones = np.array([mask.bit_count() for mask in range(1 << bits)])
-    return np.maximum(_PEAK >> 2 * ones, 1)
+    return np.maximum(_PEAK >> halvings * ones, 1)
 
 
 def code_columns(

@@ -15,7 +15,7 @@ from sagesplat.formats.quantisation import PER_COLOUR, in_buckets, logits_of_byt
 from sagesplat.formats.spz import flipped
 from sagesplat.formats.stream_columns import AXIS_BITS, LARGEST, ROTATIONS, Columns, Layout
 
-MAGIC, VERSION = b"SGST", 2
+MAGIC, VERSION = b"SGST", 3
 _HEADER = struct.Struct("<4sBBBBBBBBffffffhhhH")
 SIZE = _HEADER.size
 _ANTIALIASED, _TWO_OPACITIES = 1, 2  # flags

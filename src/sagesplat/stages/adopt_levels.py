@@ -187,7 +187,8 @@ def _write(
     run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     g = ladder.gaussians.select(torch.from_numpy(packed(ladder.gaussians, ladder.sizes)))
     chunks = write_increments(
-        run.increments, g, ladder.sizes, job.names(), replaces=ladder.replaces,
+        run.increments, g, ladder.sizes, job.names(), label_of={label: label for label in ladder.sizes},
+        replaces=ladder.replaces,
         kind=lambda _, level: "ply" if lossless and level > num_lower else "spz",
         fine=range(coarse + 1, levels + 1), antialiased=job.antialiased,
     )  # fmt: skip

@@ -78,8 +78,8 @@ def increment_files(job: Job, folder: Path, kind: FileFormat) -> list[Increment]
         g = classic(job, g)
         g = replace(g, shN=torch.nn.functional.pad(g.shN, (0, 0, 0, BASES[-1] - g.shN.shape[1])))
     return write_increments(
-        folder, g, ladder.sizes, job.names(), replaces=ladder.replaces,
-        kind=kind, fine=ladder.levels if streams else (),
+        folder, g, ladder.sizes, job.names(), label_of={one.cell: one.label_id for one in listed},
+        replaces=ladder.replaces, kind=kind, fine=ladder.levels if streams else (),
         antialiased=antialiased,
     )  # fmt: skip
 

@@ -55,7 +55,8 @@ def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
     antialiased = trains_antialiased(job)
     work, target = folder / ".chunks", folder / "chunks"
     sizes = {label: (n,) for label, n in g.counts().items()}
-    chunks = write_increments(work, g, sizes, job.names(), antialiased=antialiased)
+    label_of = {label: label for label in sizes}
+    chunks = write_increments(work, g, sizes, job.names(), label_of=label_of, antialiased=antialiased)
     target.mkdir(exist_ok=True)
     for chunk in chunks:
         (work / chunk.uri).replace(target / chunk.uri)

@@ -50,26 +50,29 @@ def move_levels(job: Job, new: Job, made: Relabelled) -> None:
     }
     with TemporaryDirectory(dir=new.run.adapted) as work:
         written = write_streams(
-            Path(work) / "streams", g, sizes, made.names, second=second, antialiased=job.antialiased,
-            grids=grids,
+            Path(work) / "streams", g, sizes, made.names, label_of={label: label for label in sizes},
+            second=second, antialiased=job.antialiased, grids=grids,
         )  # fmt: skip
         decoded, seconds = read_streams(Path(work) / "streams", written.increments)
         for one in {one.uri for one in read_index(folder)} - {one.uri for one in kept}:
             (folder / one).unlink()
         for one in {one.uri for one in written.increments}:
             shutil.move(Path(work) / "streams" / one, folder / one)
-    write_index(folder, sorted([*kept, *written.increments], key=lambda one: (one.label_id, one.level)))
+    write_index(
+        folder, sorted([*kept, *written.increments], key=lambda one: (one.label_id, one.cell, one.level))
+    )
     _write_ladder(job, new, kept, (decoded, written.sizes, seconds))
     assert (folder / INDEX).exists()
 
 
 def _headers(folder: Path) -> dict[int, Header]:
-    """The header of each category's stream, by label id."""
+    """The header of each cell's stream, by cell id."""
     found = {}
     for one in read_index(folder):
-        if one.label_id not in found:
+        if one.cell not in found:  # its first increment, which begins with the header
             with (folder / one.uri).open("rb") as file:
-                found[one.label_id] = read_stream_header(file.read(SIZE))
+                file.seek(one.offset)
+                found[one.cell] = read_stream_header(file.read(SIZE))
     return found
 
 

@@ -17,7 +17,7 @@ from sagesplat.formats.levels import check_level, read_level, write_level, write
 from sagesplat.formats.offsets import read_offset
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.spz import encode_spz, read_spz
-from sagesplat.formats.stream import decode_stream, encode_stream
+from sagesplat.formats.stream import decode_stream, encode_stream, starts_of_streams
 from sagesplat.formats.stream_increments import read_streams
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
@@ -29,7 +29,7 @@ from tests.fuzz.hostile import Reader
 from tests.fuzz.readers.making import PHOTOS, as_json, file, splats, written
 
 SETTINGS = json.dumps({"settings": {"steps": 2, "antialiased": True}})  # of the checkpoint
-CHUNK = {"label_id": 2, "level": 1, "count": 3, "nbytes": 99, "gpu_bytes": 48, "sha256": "0" * 64}
+CHUNK = {"label_id": 2, "cell": 2, "level": 1, "count": 3, "nbytes": 99, "gpu_bytes": 48, "sha256": "0" * 64}
 
 
 def _ply(folder: Path, size: int) -> list[bytes]:
@@ -47,7 +47,14 @@ def _streams(folder: Path, size: int) -> list[bytes]:
         return [encode_stream(_equal(3 * size), [size, 3 * size]).content]
     second = SecondOpacities(torch.linspace(-3, 3, 5), {2: (0.0, 0.5, 1.0)})
     some = [encode_stream(splats(5, bases), [1, 3, 5]).content for bases in (0, 3, 15)]
-    return [*some, encode_stream(splats(5), [1, 3, 5], second=second).content]
+    some.append(encode_stream(splats(5), [1, 3, 5], second=second).content)
+    return [*some, some[0] + some[-1] + some[1]]
+
+
+def _read_streams(folder: Path, content: bytes) -> None:
+    starts = starts_of_streams(content)
+    for start, end in pairwise([*starts, len(content)]):
+        decode_stream(content[start:end])
 
 
 def _equal(count: int) -> Gaussians:
@@ -69,13 +76,15 @@ def _index(folder: Path, size: int) -> list[bytes]:
 
 
 def _ranges(folder: Path) -> list[dict[str, Any]]:
-    """The entries of a coded stream with two opacities, which lies in the folder."""
+    """The entries of two coded streams with two opacities, which lie in one file of the folder."""
     second = SecondOpacities(torch.linspace(-3, 3, 5), {2: (0.0, 0.5, 1.0)})
     coded = encode_stream(splats(5), [1, 3, 5], second=second)
-    (folder / "sky-0.sgst").write_bytes(coded.content)
+    (folder / "sky-0.sgst").write_bytes(2 * coded.content)
+    part = CHUNK | {"uri": "sky-0.sgst"}
     return [
-        CHUNK
-        | {"uri": "sky-0.sgst", "level": k, "count": k, "nbytes": high - low, "offset": low, "weight": w}
+        part
+        | {"cell": 2 + i, "level": k, "count": k, "nbytes": high - low, "offset": start + low, "weight": w}
+        for i, start in enumerate((0, len(coded.content)))
         for k, (low, high), w in zip((1, 2), pairwise((0, *coded.ends)), coded.weights, strict=False)
     ]
 
@@ -160,7 +169,7 @@ READERS = (
         3000,
     ),
     Reader("spz", ".spz", _spz, file("g.spz", read_spz), 10_000),
-    Reader("stream", ".sgst", _streams, lambda folder, content: decode_stream(content), 10_000),
+    Reader("stream", ".sgst", _streams, _read_streams, 10_000),
     Reader("chunks", ".json", _index, file("index.json", _read_index)),
     Reader("checkpoint", ".npz", checkpoints, file("c.npz", _read_checkpoint)),
     Reader("level", ".npz", _levels, file("000007.npz", _read_level)),

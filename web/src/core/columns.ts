@@ -11,6 +11,7 @@ const POSITION_BITS = 51;
 const PEAK = 512; // count of the likeliest symbol of a new table
 const CLASSES = 4; // of first opacities: rows of the table of second ones
 const FLAT = 128; // of each symbol of a new table where none is likelier
+const LIKELY = 64; // of an opacity that is not the largest
 
 const peak = (likeliest: number, half: number) => (symbol: number) =>
   Math.max(1, PEAK >> Math.min(31, Math.floor(Math.abs(symbol - likeliest) / half)));
@@ -75,18 +76,20 @@ type Tables = readonly [masks: Table, green: Table, red: Table, blue: Table];
 function tablesOf(degree: number): Tables {
   const values = (rows: number) => new Table(rows, 32, peak(15, 0.5));
   const rows = (BASES[degree - 1] as number) + 1;
-  const ofMasks = new Table(rows, 1 << (2 * degree + 1), (mask) => Math.max(1, PEAK >> (2 * ones(mask))));
+  const ofMasks = new Table(rows, 1 << (2 * degree + 1), (mask, row) =>
+    Math.max(1, PEAK >> (Math.max(4 - row, 2) * ones(mask))),
+  );
   return [ofMasks, values(1), values(7), values(15)];
 }
 
 /** What every stream begins with. */
 const NEW = {
-  gap: new Table(1, POSITION_BITS + 1, peak(24, 4)),
-  scale: new Table(3, 128, (symbol, row) => (row ? peak(9, 6) : peak(64, 12))(symbol)),
+  gap: new Table(1, POSITION_BITS + 1, peak(18, 3)),
+  scale: new Table(3, 128, (symbol, row) => (row ? peak(5, 5) : peak(64, 5))(symbol)),
   rotation: new Table(11, 255, (symbol, row) =>
     Math.abs(symbol - 127) <= (ROTATIONS[row] as number) ? FLAT : 0,
   ),
-  colour: new Table(3, 160, (symbol, row) => (row ? peak(80, 4) : peak(80, 12))(symbol)),
+  colour: new Table(3, 160, (symbol, row) => (row ? peak(80, 5) : peak(80, 10))(symbol)),
   bands: [tablesOf(1), tablesOf(2), tablesOf(3)],
 };
 
@@ -104,9 +107,10 @@ export class Columns {
 
   constructor(private readonly header: Header) {
     const [least, most] = [header.twoOpacities ? 0 : 1, Math.ceil(255 / header.opacityStep)];
-    const opacity = (symbol: number) => (symbol >= least && symbol <= most ? FLAT : 0);
-    this.opacity = new Table(1, 256, opacity);
-    this.second = new Table(CLASSES, 256, opacity);
+    const flat = (symbol: number) => (symbol >= least && symbol <= most ? LIKELY : 0);
+    const opaque = (symbol: number) => (symbol === most ? PEAK : flat(symbol));
+    this.opacity = new Table(1, 256, opaque);
+    this.second = new Table(CLASSES, 256, (symbol, row) => (row < CLASSES - 1 ? flat : opaque)(symbol));
     this.largest = most;
     this.bands = NEW.bands.slice(0, header.degree).map(([masks, green, red, blue]) => {
       return [masks.copy(), green.copy(), red.copy(), blue.copy()];

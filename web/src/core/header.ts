@@ -2,7 +2,7 @@
 
 export const HEADER_BYTES = 44;
 const MAGIC = 0x53475354;
-const VERSION = 2;
+const VERSION = 3;
 const GREATEST = 1e18;
 
 /** What a stream says of all its Gaussians. */

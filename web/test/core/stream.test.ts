@@ -74,8 +74,8 @@ describe.each(golden)("$name", (one) => {
 
 test.each([
   [0, 1, "not a sagesplat-stream"],
-  [4, 1, "another version"],
-  [4, 3, "another version"],
+  [4, 2, "another version"],
+  [4, 4, "another version"],
   [5, 4, "unknown flags"],
   [6, 4, "impossible header"],
   [7, 0, "impossible header"],

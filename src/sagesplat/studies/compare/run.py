@@ -415,12 +415,16 @@ def encode_set(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
     """Bytes by label id, one file each encoded as the run's increments are, and what a viewer decodes."""
     streams = any(one.format == "stream" for one in read_index(job.run.increments))
     whole = {label: (count,) for label, count in g.counts().items()}
+    names, label_of = job.names(), {label: label for label in whole}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "increments"
         if streams:
-            increments = write_streams(path, g, whole, job.names(), antialiased=job.antialiased).increments
+            made = write_streams(path, g, whole, names, label_of=label_of, antialiased=job.antialiased)
+            increments = made.increments
         else:
-            increments = write_increments(path, g, whole, job.names(), antialiased=job.antialiased)
+            increments = write_increments(
+                path, g, whole, names, label_of=label_of, antialiased=job.antialiased
+            )
         arrived = read_increments(path, increments) if increments else g
     return {c.label_id: c.nbytes for c in increments}, arrived
 

@@ -105,7 +105,9 @@ class _BundleLevel:
     def increment(self, label_id: int, number: int) -> Increment:
         uri = self.uri.removeprefix("chunks/")
         sizes = self.count, self.bytes, self.gpuBytes
-        return Increment(label_id, number, uri, *sizes, self.sha256, self.refine, self.offset, self.weight)
+        return Increment(
+            label_id, label_id, number, uri, *sizes, self.sha256, self.refine, self.offset, self.weight
+        )
 
 
 @dataclass(frozen=True)
