@@ -70,7 +70,7 @@ def result(run: Path, path: Path, column: int = 0) -> None:
     """A test view of a run: photo, full model, composed scene, categories with their names. PNG."""
     job = Job(RunDir(run), lambda event: None)
     plan = scene_plan(job, *main_target(job.run))
-    composed = job.ladder.compose(plan.levels) if job.antialiased else read_ply(job.run.composed)
+    composed = plan.compose(job.ladder) if job.antialiased else read_ply(job.run.composed)
     panel = picture_panels(job, composed)[column]
     sizes = method_of(job).bytes_to_send or {}
     full = sum(last_counts(sizes).values()) / MB

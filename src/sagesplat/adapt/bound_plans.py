@@ -1,14 +1,16 @@
-"""Plans for a viewpoint from lower bounds: the cheapest levels that keep a target. Plans within a budget."""
+"""Plans for a viewpoint: the cheapest levels that keep a target. Plans within a budget."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sagesplat.adapt.allocate import best_within, cheapest
+from sagesplat.adapt.cell_models import Expected, FidelityModel, needed, promised
+from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.fill import fill
 from sagesplat.adapt.plan import Choice, Plan, Status, check_target
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel, where
@@ -19,12 +21,19 @@ Unit = Literal["bytes", "gpu-bytes", "count"]
 
 @dataclass(frozen=True, eq=False)
 class Costs:
-    """What each category's levels cost in full; rows are `labels`, columns levels 1 to K."""
+    """What the levels of each category, or cell, cost in full; rows are `labels`, columns levels 1 to K."""
 
-    labels: tuple[int, ...]  # ids, ascending
+    labels: tuple[int, ...]  # ids of categories or cells, ascending
     count: Int[np.ndarray, "L K"]  # Gaussians
     transfer_bytes: Int[np.ndarray, "L K"]  # bytes of the increments
     gpu: Int[np.ndarray, "L K"]  # bytes on the viewer's GPU
+
+    def by_label(self, label_of: Mapping[int, int]) -> "Costs":
+        """Those of categories with all their cells at one level, from those of the cells."""
+        labels, column = np.unique([label_of[cell] for cell in self.labels], return_inverse=True)
+        member = (column == np.arange(len(labels))[:, None]).astype(np.int64)
+        sums = (member @ costs for costs in (self.count, self.transfer_bytes, self.gpu))
+        return Costs(tuple(labels.tolist()), *sums)
 
     def of(self, unit: Unit) -> Int[np.ndarray, "L K"]:
         """The costs in a unit."""
@@ -77,49 +86,113 @@ def quality_at(
     return Quality(kind or "ssim", mean, bound, far, calibrated)
 
 
-def plan_for_view(
+def quality_of_cells(
+    models: Mapping[int, FidelityModel],
+    expected: Expected,
+    sight: Float[np.ndarray, "V C"],
+) -> Quality:
+    """Predict the fidelity of categories with all their cells at one level; `sight`: the cells' distances."""
+    V, C, K = expected.mean.shape
+    mean = np.full((V, len(expected.labels), K), np.nan)
+    bound = mean.copy()
+    for k in range(K):
+        mean[..., k] = expected.of_composition(np.full((V, C), k + 1))
+        bound[..., k] = promised(models, expected, mean[..., k])
+    member = expected.column[:, None] == np.arange(len(expected.labels))
+    far = np.where(member, np.nan_to_num(sight, nan=np.inf)[..., None], np.inf).min(1, initial=np.inf)
+    certain = [label in models and models[label].status == "calibrated" for label in expected.labels.tolist()]
+    return Quality("fidelity", mean, bound, np.where(np.isinf(far), np.nan, far), np.array(certain, bool))
+
+
+def plan_for_cells(
+    models: Mapping[int, FidelityModel],
+    expected: Expected,
     quality: Quality,
     costs: Costs,
     target: float,
     view: int,
-    pixels: Float[np.ndarray, " L"] | None = None,
 ) -> Plan:
-    """Choose the cheapest level of each category whose lower bound reaches a target in one view.
+    """Choose the levels of the cells by which each category is promised a fidelity in one view.
 
-    A plan for fidelity is then filled (`adapt.fill`), so that the image as a whole is no worse than with all
-    categories at one level, at equal bytes.
+    They are the ones of the fewest bytes (`adapt.cell_plans`), filled so that the image as a whole is no
+    worse than with all cells at one level, at equal bytes (`adapt.fill`). Cells out of sight get the
+    first one.
+
+    Args:
+        models: Of fidelity, by label id.
+        expected: From V viewpoints.
+        quality: The same with all cells at one level (`quality_of_cells`).
+        costs: What the cells' levels cost; bytes to send are minimised.
+        target: Above 0 and at most 1.
+        view: Row of `expected`.
+
+    Returns:
+        One choice per category, with the highest level of its cells; and the levels of the cells.
+
+    Raises:
+        RunError: For an impossible target.
+    """
+    check_target(target, "fidelity")
+    mean, share = expected.mean[view], expected.share[view]
+    least = needed(models, expected, target)[view]
+    found = reach(costs.transfer_bytes, mean, share, expected.column, least)
+    levels = fill(found.levels, mean, costs.transfer_bytes, share)
+    bound = promised(models, expected, expected.of_composition(np.tile(levels + 1, (len(expected.share), 1))))
+    shown = expected.category_shares()[view] > 0
+    choices = []
+    for column, label in enumerate(expected.labels.tolist()):
+        mine = np.flatnonzero(expected.column == column)
+        if label not in models:
+            status: Status = "no model"
+        elif np.isnan(least[column]) and shown[column]:
+            status = "no promise"
+        else:
+            status = "ok" if found.met[column] else "infeasible"
+        taken = costs.count[mine, levels[mine]], costs.transfer_bytes[mine, levels[mine]]
+        choices.append(
+            Choice(
+                label_id=label,
+                level=int(levels[mine].max()) + 1,
+                predicted=float(bound[view, column]),
+                distance=float(quality.distance[view, column]),
+                count=int(taken[0].sum()),
+                status=status,
+                transfer_bytes=int(taken[1].sum()),
+                calibrated=bool(quality.calibrated[column]) if np.isfinite(bound[view, column]) else None,
+            )
+        )
+    cells = dict(zip(costs.labels, (levels + 1).tolist(), strict=True))
+    return Plan(float(target), view, tuple(choices), quality="fidelity", cells=cells)
+
+
+def plan_for_view(quality: Quality, costs: Costs, target: float, view: int) -> Plan:
+    """Choose the cheapest level of each category whose lower bound reaches a target in one view.
 
     Args:
         quality: Predictions of `quality_at`.
         costs: What the levels cost; bytes to send are minimised.
         target: Above 0 and at most 1, of the quality's kind.
         view: Row of `quality`.
-        pixels: [L], that each category has in the view; None: unknown, nothing is filled.
 
     Returns:
         One choice per category; "infeasible" where no level reaches the target, "no promise" where the view
-        is too far from all that was sampled: then the highest level. A category without pixels and without a
-        bound is chosen by what is expected of it, as nobody sees it.
+        is too far from all that was sampled: then the highest level.
 
     Raises:
         RunError: For an impossible target.
     """
     check_target(target, quality.kind)
     bound, mean = quality.bound[view], quality.mean[view]
-    known, promised = ~np.isnan(mean).all(1), ~np.isnan(bound).all(1)
-    if pixels is not None:
-        unseen = known & ~promised & (pixels == 0)
-        bound = np.where(unseen[:, None], mean, bound)
+    known, proven = ~np.isnan(mean).all(1), ~np.isnan(bound).all(1)
     found = cheapest(bound, costs.transfer_bytes, target)
-    levels = found.levels
-    if quality.kind == "fidelity" and pixels is not None:
-        levels = fill(levels, mean, costs.transfer_bytes, pixels)
     lost = np.isnan(bound).all(1)
     statuses = np.select(
         [~known, lost, found.missed], ["no model", "no promise", "infeasible"], "ok"
     ).tolist()
-    calibrated = [bool(c) if p else None for c, p in zip(quality.calibrated, promised, strict=True)]
-    choices = make_choices(costs, levels, quality.bound[view], quality.distance[view], statuses, calibrated)
+    calibrated = [bool(c) if p else None for c, p in zip(quality.calibrated, proven, strict=True)]
+    choices = make_choices(
+        costs, found.levels, quality.bound[view], quality.distance[view], statuses, calibrated
+    )
     return Plan(float(target), view, choices, quality=quality.kind)
 
 
@@ -153,6 +226,31 @@ def plan_within(
     choices = make_choices(costs, found.levels, mean, nowhere, statuses)
     fits = found.status == "ok"
     return Plan(math.nan, None, choices, budget=float(budget), unit=unit, fits=fits, quality=kind)
+
+
+def by_label(plan: Plan, label_of: Mapping[int, int], pixels: Float[np.ndarray, " C"]) -> Plan:
+    """A plan of cells as one of categories: what is predicted of them is the mean over pixels."""
+    weight = dict(zip(sorted(label_of), pixels.tolist(), strict=True))
+    cells: dict[int, list[Choice]] = {}
+    for choice in plan.choices:
+        cells.setdefault(label_of[choice.label_id], []).append(choice)
+    choices = []
+    for label, mine in sorted(cells.items()):
+        known = [one for one in mine if weight[one.label_id] > 0 and not math.isnan(one.predicted)]
+        total = sum(weight[one.label_id] for one in known)
+        mean = sum(weight[one.label_id] * one.predicted for one in known) / total if total else math.nan
+        choices.append(
+            Choice(
+                label_id=label,
+                level=max(one.level for one in mine),
+                predicted=mean,
+                distance=math.nan,
+                count=sum(one.count for one in mine),
+                status="ok" if known else "no model",
+                transfer_bytes=sum(one.transfer_bytes or 0 for one in mine),
+            )
+        )
+    return replace(plan, choices=tuple(choices), cells=plan.levels)
 
 
 def pooled(

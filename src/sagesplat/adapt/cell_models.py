@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from sagesplat.adapt.cells import Cells, Sight, look
 from sagesplat.adapt.process import inputs_of, matern32
@@ -208,11 +208,6 @@ def needed(
     return found
 
 
-def promise_possible(shares: Float[np.ndarray, "V L"], least: float) -> Bool[np.ndarray, "V L"]:
-    """Whether a category covers enough of a picture for a promise."""
-    return shares >= least
-
-
 def write_fidelity(path: Path, models: Mapping[int, FidelityModel]) -> None:
     """fidelity.json: one entry per category."""
     write_json(path, {"models": [to_plain(model) for model in models.values()]})
@@ -236,7 +231,7 @@ def read_fidelity(path: Path | str) -> dict[int, FidelityModel]:
 def _check(model: FidelityModel) -> None:
     """ValueError for a model whose parts do not belong together."""
     V, calibration = len(model.views), model.calibration
-    if not model.cells or not len(model.cells[0].offsets) or not V or not model.photos.size:
+    if not (model.cells and len(model.cells[0].offsets) and V and model.photos.size):
         raise ValueError("a model of nothing")
     for cell in model.cells:
         n, K = cell.weights.shape if len(cell.rows) else (0, len(cell.offsets))
@@ -244,7 +239,7 @@ def _check(model: FidelityModel) -> None:
             raise ValueError("lists of unequal length")
         if {K, len(cell.offsets)} != {len(model.levels)}:
             raise ValueError("cells of unequal levels")
-        if n and not (0 <= cell.rows.min() and cell.rows.max() < V):
+        if n and (cell.rows.min() < 0 or cell.rows.max() >= V):
             raise ValueError("views out of range")
         numbers = cell.offsets, cell.log_distances, cell.weights, cell.factors
         if not all((np.abs(array) < LARGEST).all() for array in numbers):

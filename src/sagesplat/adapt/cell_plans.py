@@ -2,8 +2,8 @@
 
 Every cell begins at its lowest level. The upgrades of a cell in sight are the segments of the upper concave
 hull of (bytes, share * mean) over its levels, as in `adapt.fill`. Those of a category's cells are taken by
-falling slope, of equal ones the lower cell first, until sum share * mean >= needed * sum share. What is needed
-is the same for all levels of a cell, so no other set of segments is cheaper by more than the last one.
+falling slope, of equal ones the lower cell first, until sum share * mean >= needed * sum share: no other
+set of segments is cheaper by more than the last one.
 `web/src/core/planner.ts` does the same; tests/data/plans.json (mode "cells") checks both.
 """
 
@@ -40,8 +40,8 @@ def reach(
         mean: Expected fidelity, never falling along the levels; NaN: unknown.
         share: Of the picture's pixels; 0: out of sight.
         column: Of each cell's category, 0 to L - 1.
-        needed: Mean fidelity of each category; NaN: nothing is promised, its cells in sight stay in full. From
-            1 on they are in full too.
+        needed: Mean fidelity of each category; NaN: nothing is promised, its cells in sight stay in full;
+            from 1 on too.
     """
     K = mean.shape[1]
     full = (share > 0) & ~(needed[column] < 1)

@@ -83,7 +83,7 @@ def _described(
     means: Float[np.ndarray, "n 3"], areas: Float[np.ndarray, " n"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Bounds, grid, area and radius of one cell."""
-    rng, total = np.random.default_rng(0), max(float(areas.sum()), 1e-300)
+    rng, total = np.random.default_rng(0), max(areas.sum(dtype=float), 1e-300)
     some, weight = np.arange(len(means)), areas
     if len(means) > _SAMPLE:
         some = rng.choice(len(means), _SAMPLE, p=areas / total)

@@ -202,7 +202,7 @@ def evaluate(
                 **_of_whole({}, {}),
             })  # fmt: skip
     for plan in plans:
-        composed = compose(plan) if compose else ladder.compose(plan.levels)
+        composed = compose(plan) if compose else plan.compose(ladder)
         for row, measured, fidelity in measure_all(composed, others):
             for label, values in measured.items():
                 level, known = plan.levels.get(label, -1), label in plan.levels

@@ -212,14 +212,14 @@ def plan_nominal(
     A category is at its last level where nothing is promised, and a cell out of sight at its first one.
     `cost`: bytes of each cell's levels.
     """
-    V, C, K = expected.mean.shape
+    V, C = expected.share.shape
     planned = np.ones((V, len(nominal), C), int)
     for j, target in enumerate(nominal):
         least = needed(models, expected, float(target))
         for row in range(V):
-            planned[row, j] = reach(
-                cost, expected.mean[row], expected.share[row], expected.column, least[row]
-            ).levels + 1
+            planned[row, j] = (
+                reach(cost, expected.mean[row], expected.share[row], expected.column, least[row]).levels + 1
+            )
     return planned
 
 
@@ -277,7 +277,7 @@ def hold_all_categories(
     All ask for the nominal target that keeps it.
     """
     floor, asked = np.full(len(TARGETS), -np.inf), {}
-    for label, model in models.items():
+    for label in models:
         if not (views := len(trial.views(label))):
             continue
         asked[label] = _empirical(trial.critical(label), confidence)
@@ -317,7 +317,7 @@ def calibrated(
         nominal targets are the largest ones of all categories and of its own: "uncalibrated".
     """
     fewest, asked = fewest_views(confidence), {}
-    for label, model in models.items():
+    for label in models:
         if len(trial.views(label)) >= fewest:
             values = [conformal_quantile(values, confidence) for values in trial.critical(label)]
             asked[label] = np.where(held, np.maximum(values, TARGETS), values)

@@ -97,8 +97,8 @@ class RecordedLadder(Ladder):
 class PrefixLadder(Ladder):
     """One ordered set of Gaussians per cell, of which each level is a range of rows.
 
-    Ids, those of its Gaussians included, are ids of cells. Level k of a cell ends at row `sizes[cell][k - 1]`.
-    It begins at row 0; or, where it or a level below replaces what is below it, where that begins (`starts`).
+    Ids, those of its Gaussians included, are of cells. Level k of a cell ends at row `sizes[cell][k - 1]`. It
+    begins at row 0; or, where it or a level below replaces what is below it, where that begins (`starts`).
     """
 
     path: Path
@@ -209,7 +209,9 @@ class NestedLadder(Ladder):
         """Gaussians of cells with the label ids of their categories, the rows of each together."""
         ids = np.array(sorted(self.label_of))
         labels = np.array([self.label_of[cell] for cell in ids.tolist()], np.int16)
-        found = torch.from_numpy(labels[np.searchsorted(ids, g.label_ids.cpu().numpy())]).to(g.label_ids.device)
+        found = torch.from_numpy(labels[np.searchsorted(ids, g.label_ids.cpu().numpy())]).to(
+            g.label_ids.device
+        )
         g = replace(g, label_ids=found)
         if (found[1:] < found[:-1]).any():
             g = g.select(torch.argsort(found, stable=True))

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sagesplat.adapt.eq3 import SsimModel
+from sagesplat.adapt.ladder import Ladder, NestedLadder
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
-from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
+from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN, Gaussians
 from sagesplat.core.limits import Count, LabelId, NotNegative, NumberOrNaN, Share, StepNumber
 
 Models = Mapping[tuple[int, int], SsimModel]  # by (label id, level)
@@ -39,7 +40,7 @@ class Reached:
 
 @dataclass(frozen=True)
 class Choice:
-    """The level of one category."""
+    """The level of one category; where its cells have levels of their own, the highest of these."""
 
     label_id: LabelId
     level: StepNumber  # of recorded levels the training step, of nested ones 1 to K
@@ -74,11 +75,19 @@ class Plan:
     unit: str | None = None  # bytes, gpu-bytes or count
     fits: bool = True  # whether it keeps the budget
     quality: QualityKind = "ssim"  # of which it is the target
+    cells: dict[int, int] | None = None  # level by cell id; None: that of the category
 
     @property
     def levels(self) -> dict[int, int]:
         """Level by label id."""
         return {choice.label_id: choice.level for choice in self.choices}
+
+    def compose(self, ladder: Ladder) -> Gaussians:
+        """The Gaussians of the ladder that it chose."""
+        if self.cells is None:
+            return ladder.compose(self.levels)
+        assert isinstance(ladder, NestedLadder)
+        return ladder.compose_cells(self.cells)
 
     @property
     def count(self) -> int:

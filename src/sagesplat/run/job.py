@@ -268,7 +268,9 @@ class Job:
     def ladder(self) -> Ladder:
         """The levels to choose from: prefixes of the nested model, or those that training recorded."""
         nested = self.run.ladder == "nested"
-        ladder = NestedLadder(read_prefixes(self.run.prefixes), self.cells.label_of) if nested else self.recorded
+        ladder = (
+            NestedLadder(read_prefixes(self.run.prefixes), self.cells.label_of) if nested else self.recorded
+        )
         path = self.run.prefixes if nested else self.run.levels
         self.check_named(path, sorted({label for label, _ in ladder.counts}))
         return ladder

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from sagesplat.adapt.cells import describe_cells, write_cells
 from sagesplat.adapt.ladder import read_prefixes
 from sagesplat.adapt.observe import as_unit, render_rgb
 from sagesplat.adapt.renders import Renders
@@ -86,7 +87,7 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
-    run_stage(job, "nest", settings, inputs, [run.prefixes, run.increments], make, swaps=True)
+    run_stage(job, "nest", settings, inputs, [run.prefixes, run.cells, run.increments], make, swaps=True)
 
 
 def _lower_levels(
@@ -196,6 +197,7 @@ def _write(
     if not lossless and (other := sum(chunk.format != "spz" for chunk in chunks)):
         job.emit(Warned(f"{other} files are PLY: SPZ's steps of positions are larger than their Gaussians"))
     write_set(run.prefixes, sent, settings["steps"], ladder.sizes, replaces=ladder.replaces, exact=True)
+    write_cells(run.cells, describe_cells(sent, {label: label for label in ladder.sizes}))
     size, total = sum(chunk.nbytes for chunk in chunks), len(sent)
     top = read_prefixes(run.prefixes).load(levels)
     decibels = _loss(job, top, before)

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from sagesplat.adapt.bound_plans import Costs
+from sagesplat.adapt.cell_models import FidelityModel
 from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.core.config import LadderKind, PlanConfig, RunConfig
@@ -199,7 +200,7 @@ class FinishedRun:
         return self._method if isinstance(self._method, NestedLevels) else NestedLevels(self.job)
 
     @property
-    def fidelity(self) -> dict[int, ViewModel]:
+    def fidelity(self) -> dict[int, FidelityModel]:
         """Models of fidelity by label id (nested ladder). RunError before `sagesplat fit`."""
         return self._nested.fidelity
 
@@ -269,4 +270,4 @@ class FinishedRun:
         Raises:
             RunError: For a level that the ladder does not have.
         """
-        return self.job.ladder.compose(plan.levels if isinstance(plan, Plan) else plan)
+        return plan.compose(self.job.ladder) if isinstance(plan, Plan) else self.job.ladder.compose(plan)

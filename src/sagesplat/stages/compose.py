@@ -44,7 +44,7 @@ def compose_plan(job: Job) -> None:
 
     def make() -> list[str]:
         plan = main_plan(job)
-        g = job.ladder.compose(plan.levels)
+        g = plan.compose(job.ladder)
         write_ply(run.composed, classic(job, g), job.names(), parents=job.parents_by_id)
         write_offset(run.composed, job.scene.offset)
         size = f"{plan.nbytes / 1e6:.1f} MB at 248 bytes each"

@@ -35,7 +35,7 @@ def evaluate_plans(job: Job) -> None:
         table = evaluate(
             job.scene, job.photos, job.level_masks, job.ladder, plans, method.predicted,
             others=_others(flip, lpips), uniform=_levels_beside(job, plans),
-            compose=lambda plan: job.ladder.compose(plan.levels), full=job.came_in, valid=job.valid,
+            full=job.came_in, valid=job.valid,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
         )  # fmt: skip

@@ -132,7 +132,7 @@ def export_scene(
         whole = job.ladder.load(level)
     else:
         plan = main_plan(job) if target is None else scene_plan(job, *target)
-        whole = job.ladder.compose(plan.levels)
+        whole = plan.compose(job.ladder)
     g = whole.of_labels(wanted)
     if gone:
         job.emit(Warned(_holes(job, whole, g, without)))

@@ -4,7 +4,9 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from sagesplat.adapt.fidelity import distances_at, measure_compositions, shown_enough
+from sagesplat.adapt.bound_plans import Costs
+from sagesplat.adapt.cell_models import FidelityModel, expect
+from sagesplat.adapt.fidelity import measure_compositions, pooled_cells, shown_enough
 from sagesplat.adapt.fidelity_models import (
     NOMINAL,
     Trial,
@@ -14,21 +16,21 @@ from sagesplat.adapt.fidelity_models import (
     plan_nominal,
     remove_composition_bias,
 )
-from sagesplat.adapt.viewpoint import ViewModel
 from sagesplat.adapt.viewpoints import capture_cameras
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
+from sagesplat.formats.increments import totals
 from sagesplat.run.executor import split
 from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.results import sampled_of, viewpoints_of
+from sagesplat.stages.results import increments_of, sampled_of, viewpoints_of
 
 _ROUNDS = 2  # after one, categories whose neighbours moved much would seem to be beyond help
 
 
-def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
+def fit_drawn(job: Job, config: FitConfig) -> dict[int, FidelityModel]:
     """Models of fidelity by label id, calibrated at viewpoints that nothing was fitted to."""
     drawn, sampled, confidence = viewpoints_of(job), sampled_of(job), config.confidence
     fit = [drawn.cameras[row] for row in drawn.rows("fit")]
@@ -37,56 +39,54 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, ViewModel]:
         for name in ("bias", "calibration")
     )
     models = fit_fidelity(
-        sampled, fit, job.scene.scale, confidence, drawn.focal, drawn.rule.screens, capture_cameras(job.scene)
+        sampled,
+        job.cells,
+        fit,
+        job.scene.scale,
+        confidence,
+        drawn.focal,
+        drawn.rule.screens,
+        capture_cameras(job.scene),
     )
     models.pop(UNLABELLED, None)  # has no target and stays in full
     for _ in range(_ROUNDS):
-        models = remove_composition_bias(models, trial(job, config, models, sampled.labels, bias), confidence)
-    models, held = hold_all_categories(models, trial(job, config, models, sampled.labels, bias), confidence)
+        models = remove_composition_bias(models, trial(models, bias), confidence)
+    models, held = hold_all_categories(models, trial(models, bias), confidence)
     for _ in range(_ROUNDS):  # what calibration moved moves the neighbours
-        models = calibrated(models, trial(job, config, models, sampled.labels, calibration), confidence, held)
+        models = calibrated(models, trial(models, calibration), confidence, held)
     return models
 
 
-def trial(
-    job: Job,
-    config: FitConfig,
-    models: Mapping[int, ViewModel],
-    labels: Sequence[int],
-    compositions: "Compositions",
-) -> Trial:
+def trial(models: Mapping[int, FidelityModel], compositions: "Compositions") -> Trial:
     """Compositions planned with the models at viewpoints, measured."""
-    cameras = compositions.cameras
-    distance = compositions.distances(labels, config.distance)
-    planned = plan_nominal(models, labels, len(job.ladder.levels), distance, cameras, NOMINAL)
+    job, cameras = compositions.job, compositions.cameras
+    expected = expect(models, job.cells, cameras, len(job.ladder.levels))
+    planned = plan_nominal(models, expected, cell_costs(job).transfer_bytes, NOMINAL)
     fidelity, pixels = compositions.measure(planned)
     shown = shown_enough(pixels, cameras)
-    return Trial(labels, cameras, distance, shown, planned, fidelity)
+    return Trial(expected.labels.tolist(), shown, expected.support, fidelity)
+
+
+def cell_costs(job: Job) -> Costs:
+    """What the levels of each cell cost."""
+    cells, increments, levels = job.cells.ids.tolist(), increments_of(job), len(job.ladder.levels)
+    columns = (totals(increments, cells, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
+    return Costs(tuple(cells), *columns)
 
 
 class Compositions:
-    """Measures compositions at viewpoints, none of them twice: rounds of calibration plan many again.
+    """Measures compositions of cells at viewpoints, none twice: rounds of calibration plan many again.
 
-    `only`: ids of the categories that are wanted; what is measured of others is NaN. None: all.
+    `only`: ids of the cells that are wanted; what is measured of others is NaN. None: all.
     """
 
     def __init__(self, job: Job, cameras: Sequence[Camera], only: Collection[int] | None = None) -> None:
-        self.cameras = cameras
-        self._job, self._only = job, only
+        self.job, self.cameras, self._only = job, cameras, only
         self._known: list[dict[tuple[int, ...], np.ndarray]] = [{} for _ in cameras]
         self._pixels = np.zeros((len(cameras), 0), np.int32)
-        self._distances: np.ndarray | None = None
-
-    def distances(self, labels: Sequence[int], method: str) -> np.ndarray:
-        """As `distances_at`; all calls have the same labels and method."""
-        if self._distances is None:
-            self._distances = distances_at(
-                self._job.scene, self._job.point_labels, self.cameras, labels, method
-            )
-        return self._distances
 
     def measure(self, planned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `compositions_at`; all calls have the same labels."""
+        """As `compositions_at`."""
         wanted = [list(map(tuple, of_view.tolist())) for of_view in planned]
         new = [sorted(set(some) - set(known)) for some, known in zip(wanted, self._known, strict=True)]
         rows = [row for row, some in enumerate(new) if some]
@@ -95,14 +95,13 @@ class Compositions:
             # what is asked for twice is measured once: filled up to one length
             asked = np.array([new[row] + new[row][:1] * (most - len(new[row])) for row in rows])
             cameras = [self.cameras[row] for row in rows]
-            fidelity, pixels = compositions_at(self._job, cameras, asked, "fit", self._only)
+            fidelity, pixels = compositions_at(self.job, cameras, asked, "fit", self._only)
             for row, values in zip(rows, fidelity, strict=True):
                 self._known[row] |= dict(zip(new[row], values, strict=False))
             if not self._pixels.size:  # the first time all are new
                 self._pixels = pixels
         found = [[known[one] for one in some] for known, some in zip(self._known, wanted, strict=True)]
-        V, J, L = planned.shape
-        return np.array(found, np.float32).reshape(V, J, L + 1), self._pixels
+        return np.array(found, np.float32), self._pixels
 
 
 def compositions_at(
@@ -112,15 +111,16 @@ def compositions_at(
     stage: str,
     only: Collection[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fidelity [V, J, L + 1] of compositions (levels [V, J, L]) and pixels [V, L], divided among all.
+    """Fidelity [V, J, L] of categories in compositions of cells (levels [V, J, C]), and their pixels [V, L].
 
-    `only`: ids of the categories that are measured; the others are NaN. None: all.
+    It is divided among all who compute. `only`: ids of the cells that are measured; None: all.
     """
     rows = split(range(len(cameras)), job.pieces)
     parts = [([cameras[row] for row in some], planned[list(some)], stage, only) for some in rows]
     found = work_all(job, stage, _measure_some, parts)
     fidelity, pixels = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    return fidelity, pixels
+    member = job.cells.labels[:, None] == np.unique(job.cells.labels)
+    return pooled_cells(fidelity[..., :-1], pixels, member), (pixels @ member).astype(np.int32)
 
 
 def _measure_some(
@@ -128,7 +128,7 @@ def _measure_some(
 ) -> tuple[np.ndarray, np.ndarray]:
     cameras, planned, stage, only = part
     return measure_compositions(
-        job.ladder, cameras, planned, only=only, full=job.came_in, backend=job.backend,
+        job.by_cell, cameras, planned, only=only, full=job.came_in, backend=job.backend,
         antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress(stage, done, total)),
         references=job.references if only is None else None,

@@ -3,36 +3,46 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_within, pooled, quality_at
+from sagesplat.adapt.bound_plans import (
+    Costs,
+    Quality,
+    by_label,
+    plan_for_cells,
+    plan_for_view,
+    plan_within,
+    pooled,
+    quality_at,
+    quality_of_cells,
+)
+from sagesplat.adapt.cell_models import Expected, FidelityModel, expect, write_fidelity
+from sagesplat.adapt.cells import look
 from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.fidelity import shown_enough
-from sagesplat.adapt.observe import LabelImages, Observations, RenderedLabels
+from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel, write_promises
 from sagesplat.adapt.viewpoints import in_words
 from sagesplat.core.config import FitConfig, LadderKind, PlanConfig
 from sagesplat.core.errors import RunError
-from sagesplat.formats.increments import INDEX, totals
+from sagesplat.formats.increments import INDEX
 from sagesplat.run.job import Job
-from sagesplat.scene.scene import Camera, View
+from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.fidelity import compositions_at, fit_drawn
+from sagesplat.stages.fidelity import cell_costs, compositions_at, fit_drawn
 from sagesplat.stages.method import Curves, Method
 from sagesplat.stages.results import (
     fidelity_of,
     has_photos,
-    increments_of,
     promises_of,
     sampled_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import distances_from, label_named, observed, rendered_labels
+from sagesplat.stages.shared import distances_from, label_named, observed
 from sagesplat.stages.snapshots import Snapshots
 from sagesplat.stages.viewpoints import fit_viewpoints
 
@@ -49,7 +59,7 @@ class NestedLevels(Method):
     def __init__(self, job: Job) -> None:
         run = job.run
         self.job = job
-        self.level_files = [run.prefixes, run.increments / INDEX]
+        self.level_files = [run.prefixes, run.cells, run.increments / INDEX]
         self.sample_files = [run.viewpoints, run.sampled]
         self.model_files = [run.models, run.promises, run.fidelity]
         self.files = [*self.level_files, run.promises, run.fidelity, *self.sample_files]
@@ -64,14 +74,16 @@ class NestedLevels(Method):
 
     @cached_property
     def costs(self) -> Costs:
-        """What the levels cost."""
-        labels = sorted({label for label, _ in self.job.ladder.counts})
-        increments, levels = increments_of(self.job), len(self.job.ladder.levels)
-        columns = (totals(increments, labels, levels, name) for name in ("count", "nbytes", "gpu_bytes"))
-        return Costs(tuple(labels), *columns)
+        """What the levels of categories cost."""
+        return self.cell_costs.by_label(self.job.cells.label_of)
 
     @cached_property
-    def fidelity(self) -> dict[int, ViewModel]:
+    def cell_costs(self) -> Costs:
+        """What the levels of cells cost."""
+        return cell_costs(self.job)
+
+    @cached_property
+    def fidelity(self) -> dict[int, FidelityModel]:
         """Models of fidelity by label id."""
         return fidelity_of(self.job)
 
@@ -87,9 +99,20 @@ class NestedLevels(Method):
         far = job.distances(job.fit_config.distance)
         cameras = [view.camera for view in job.scene.views]
         return {
-            "fidelity": quality_at(self.costs, self.fidelity, far, cameras, "fidelity"),
+            "fidelity": self._of_cells(self._expected, cameras),
             "ssim": quality_at(self.costs, self.promises, far, cameras, "ssim"),
         }
+
+    @cached_property
+    def _expected(self) -> Expected:
+        """What every view of the scene is expected to see of the cells."""
+        return self._expect([view.camera for view in self.job.scene.views])
+
+    def _expect(self, cameras: Sequence[Camera]) -> Expected:
+        return expect(self.fidelity, self.job.cells, cameras, len(self.job.ladder.levels))
+
+    def _of_cells(self, expected: Expected, cameras: Sequence[Camera]) -> Quality:
+        return quality_of_cells(self.fidelity, expected, look(self.job.cells, cameras).distance)
 
     @cached_property
     def shown(self) -> np.ndarray:
@@ -99,7 +122,7 @@ class NestedLevels(Method):
     @cached_property
     def sampled(self) -> tuple[np.ndarray, np.ndarray]:
         """Fidelity of each level and pixels of each category at the viewpoints that were drawn."""
-        found = sampled_of(self.job)
+        found = sampled_of(self.job).by_label(self.job.cells.label_of)
         at = {label: i for i, label in enumerate(found.labels)}
         rows = [-1 if label == UNLABELLED else at.get(label, -1) for label in self.costs.labels]
         # unlabelled pixels have no target, and stay in full
@@ -133,11 +156,10 @@ class NestedLevels(Method):
         against_photos = (
             fit_viewpoints(self.job, self.costs, table, config, curves) if has_photos(run) else {}
         )
-        for name, path, models in (
-            ("SSIM against photos", run.promises, against_photos),
-            ("fidelity", run.fidelity, fit_drawn(self.job, config)),
-        ):
-            write_promises(path, models)
+        fidelity = fit_drawn(self.job, config)
+        write_promises(run.promises, against_photos)
+        write_fidelity(run.fidelity, fidelity)
+        for name, models in (("SSIM against photos", against_photos), ("fidelity", fidelity)):
             statuses = [model.status for model in models.values()]
             if not statuses:
                 continue  # without photos no SSIM against them
@@ -150,21 +172,22 @@ class NestedLevels(Method):
 
     def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
-        return plan_for_view(self.qualities[quality], self.costs, target, row, self.shown[row])
+        if quality == "ssim":
+            return plan_for_view(self.qualities[quality], self.costs, target, row)
+        return plan_for_cells(
+            self.fidelity, self._expected, self.qualities[quality], self.cell_costs, target, row
+        )
 
     def plan_camera(self, camera: Camera, target: float, quality: QualityKind) -> Plan:
         """See `Method`."""
-        job, models = self.job, self.fidelity if quality == "fidelity" else self.promises
-        found = quality_at(self.costs, models, distances_from(job, camera), [camera], quality)
-        pixels = None
-        if quality == "fidelity":
-            image = self._full_model[View("", camera, Path())]
-            pixels = np.array([(image == label).sum() for label in self.costs.labels], np.float64)
-        return replace(plan_for_view(found, self.costs, target, 0, pixels), view=None)
-
-    @cached_property
-    def _full_model(self) -> RenderedLabels:
-        return rendered_labels(self.job)
+        if quality == "ssim":
+            far = distances_from(self.job, camera)
+            found = quality_at(self.costs, self.promises, far, [camera], quality)
+            return replace(plan_for_view(found, self.costs, target, 0), view=None)
+        expected = self._expect([camera])
+        found = self._of_cells(expected, [camera])
+        plan = plan_for_cells(self.fidelity, expected, found, self.cell_costs, target, 0)
+        return replace(plan, view=None)
 
     def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
@@ -193,23 +216,29 @@ class NestedLevels(Method):
 
     def _in_composition(self, plans: Sequence[Plan], cameras: Sequence[Camera]) -> np.ndarray:
         """Fidelity of each category in each plan's composition, [V, J, L]; NaN where it shows too little."""
-        levels = np.array([[plan.levels[label] for label in self.costs.labels] for plan in plans])
+        label_of = self.job.cells.labels.tolist()
+        levels = np.array([[plan.levels[label] for label in label_of] for plan in plans])
         planned = np.broadcast_to(levels, (len(cameras), *levels.shape))
         fidelity, pixels = compositions_at(self.job, cameras, planned, "plan")
         shown = shown_enough(pixels, cameras)
         shown &= np.array(self.costs.labels) != UNLABELLED
-        return np.where(shown[:, None], fidelity[..., :-1], np.nan).astype(np.float64)
+        return np.where(shown[:, None], fidelity, np.nan).astype(np.float64)
 
     def plan_budget(self, config: PlanConfig) -> Plan:
         """See `Method`."""
-        weights = {label_named(self.job, name): weight for name, weight in config.weights.items()}
-        train = self.job.scene.train_ids
-        if config.quality == "fidelity":
-            mean, pixels = pooled(*self.sampled)
-        else:
+        job, asked = self.job, (config.budget, config.budget_unit)
+        weights = {label_named(job, name): weight for name, weight in config.weights.items()}
+        if config.quality == "ssim":
+            train = job.scene.train_ids
             mean, pixels = pooled(self.qualities["ssim"].mean[train], self.shown[train])
-        weight = pixels * [weights.get(label, 1.0) for label in self.costs.labels]
-        return plan_within(mean, self.costs, config.budget, config.budget_unit, weight, config.quality)
+            weight = pixels * [weights.get(label, 1.0) for label in self.costs.labels]
+            return plan_within(mean, self.costs, *asked, weight, config.quality)
+        found, label_of = sampled_of(job), job.cells.label_of
+        known = found.pixels * (job.cells.labels != UNLABELLED)
+        mean, pixels = pooled(found.fidelity.astype(np.float64), known.astype(np.float64))
+        weight = pixels * [weights.get(label, 1.0) for label in job.cells.labels.tolist()]
+        plan = plan_within(mean, self.cell_costs, *asked, weight, config.quality)
+        return by_label(plan, label_of, pixels)
 
     def amount(self, plan: Plan) -> str:
         """See `Method`."""

@@ -31,7 +31,7 @@ def make_report(job: Job, url: str = "") -> None:
         # written for other viewers is not drawn as the run draws
         other = budget_plan_of(job) is not None or job.antialiased
         plan = scene_plan(job, quality, target)
-        composed = job.ladder.compose(plan.levels) if other else read_ply(run.composed)
+        composed = plan.compose(job.ladder) if other else read_ply(run.composed)
         write_report(run.report, report_data(job, composed, quality, target, found, url))
         return []
 

@@ -4,16 +4,17 @@ The readers of the files check a file by itself. A file that was edited, or come
 sound and still not belong to the others.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from sagesplat.adapt.cell_models import FidelityModel, read_fidelity
 from sagesplat.adapt.eq3 import SsimModel, read_models
 from sagesplat.adapt.evaluate import UNIFORM, Evaluation, read_evaluation
 from sagesplat.adapt.fidelity import SampledFidelity, read_sampled
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
 from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.plan_files import read_budget_plan, read_plans
-from sagesplat.adapt.viewpoint import QualityKind, ViewModel, read_promises
+from sagesplat.adapt.viewpoint import ViewModel, read_promises
 from sagesplat.adapt.viewpoints import Viewpoints, read_viewpoints
 from sagesplat.core.errors import DataError
 from sagesplat.formats.increments import INDEX, Increment, read_index, totals
@@ -71,7 +72,11 @@ def promises_of(job: Job) -> dict[int, ViewModel]:
     """
     if not job.run.promises.exists() and not has_photos(job.run):
         return {}
-    return _view_models(job, job.run.promises, "ssim")
+    models = read_promises(job.run.promises)
+    _check_models(job, job.run.promises, models)
+    if any(model.quality != "ssim" for model in models.values()):
+        raise _foreign(job.run.promises, "fit", "its quality")
+    return models
 
 
 def has_photos(run: RunDir) -> bool:
@@ -81,19 +86,24 @@ def has_photos(run: RunDir) -> bool:
     return not run.provenance("fit").exists() or uses(run, "fit", run.observations)
 
 
-def fidelity_of(job: Job) -> dict[int, ViewModel]:
-    """Models of fidelity with their bounds, by label id, of levels that the run has."""
-    return _view_models(job, job.run.fidelity, "fidelity")
+def fidelity_of(job: Job) -> dict[int, FidelityModel]:
+    """Models of fidelity with their bounds, by label id, of the cells and levels that the run has."""
+    path, models = job.run.fidelity, read_fidelity(job.run.fidelity)
+    _check_models(job, path, models)
+    label_of = job.cells.label_of
+    for label, model in models.items():
+        _check(path, "fit", "cell", (cell.cell for cell in model.cells), _cells_of(label_of, label))
+    return models
 
 
-def _view_models(job: Job, path: Path, quality: QualityKind) -> dict[int, ViewModel]:
-    models = read_promises(path)
+def _cells_of(label_of: Mapping[int, int], label: int) -> list[int]:
+    return [cell for cell, of in label_of.items() if of == label]
+
+
+def _check_models(job: Job, path: Path, models: Mapping[int, ViewModel | FidelityModel]) -> None:
     _check(path, "fit", "category", models, job.names())
     levels = (level for model in models.values() for level in model.levels)
     _check(path, "fit", "level", levels, set(job.ladder.levels))
-    if any(model.quality != quality for model in models.values()):
-        raise _foreign(path, "fit", "its quality")
-    return models
 
 
 def viewpoints_of(job: Job) -> Viewpoints:
@@ -102,9 +112,10 @@ def viewpoints_of(job: Job) -> Viewpoints:
 
 
 def sampled_of(job: Job) -> SampledFidelity:
-    """Fidelity at the viewpoints of the set "fit", of categories and levels that the run has."""
+    """Fidelity at the viewpoints of the set "fit", of cells and levels that the run has."""
     path, sampled = job.run.sampled, read_sampled(job.run.sampled)
-    _check(path, "sample", "category", sampled.labels, {label for label, _ in job.ladder.counts})
+    if sampled.labels != tuple(job.cells.ids.tolist()):
+        raise _foreign(path, "sample", "its cells")
     V, _, K = sampled.fidelity.shape
     if len(job.ladder.levels) != K:
         raise _foreign(path, "sample", f"{K} levels")
@@ -116,14 +127,17 @@ def sampled_of(job: Job) -> SampledFidelity:
 def increments_of(job: Job) -> list[Increment]:
     """The increments of the nested levels, of categories and levels that the run has."""
     path, listed = job.run.increments / INDEX, read_index(job.run.increments)
-    _check(path, "nest", "category", (one.label_id for one in listed), {i for i, _ in job.ladder.counts})
+    _check(path, "nest", "cell", (one.cell for one in listed), job.by_cell.sizes)
     _check(path, "nest", "level", (one.level for one in listed), set(job.ladder.levels))
-    labels = sorted({label for label, _ in job.ladder.counts})
-    counts = totals(listed, labels, len(job.ladder.levels), "count").tolist()
-    for label, row in zip(labels, counts, strict=True):
+    counts, label_of = job.by_cell.counts, job.cells.label_of
+    if any(label_of.get(one.cell) != one.label_id for one in listed):
+        raise _foreign(path, "nest", "its cells")
+    cells = sorted(job.by_cell.sizes)
+    table = totals(listed, cells, len(job.ladder.levels), "count").tolist()
+    for cell, row in zip(cells, table, strict=True):
         for level, count in reversed(list(enumerate(row, 1))):
-            if count != job.ladder.counts[label, level]:
-                raise _foreign(path, "nest", f"{count:,} Gaussians of category {label}")
+            if count != counts[cell, level]:
+                raise _foreign(path, "nest", f"{count:,} Gaussians of cell {cell}")
     return listed
 
 

@@ -6,7 +6,8 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from sagesplat.adapt.fidelity import SampledFidelity, distances_at, measure_levels, write_sampled
+from sagesplat.adapt.cells import look
+from sagesplat.adapt.fidelity import SampledFidelity, measure_levels, write_sampled
 from sagesplat.adapt.fidelity_models import NOMINAL, fit_fidelity
 from sagesplat.adapt.viewpoints import (
     Rule,
@@ -43,7 +44,7 @@ _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
 def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     """Draw viewpoints, and measure every level of every category there against the full model.
 
-    Nested levels only. `fit`: how distances are measured.
+    Nested levels only. `fit`: the confidence of preliminary models.
     """
     run = job.run
     if run.ladder != "nested":
@@ -70,11 +71,10 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
         return [f"{used} viewpoints to fit to, {len(drawn.rows('bias'))} + {calibration} to calibrate on"]
 
     made_by = [run.provenance("train"), run.provenance("nest")]
-    inputs = [*run.scene_files, run.labels, method_of(job).level_files[0], *made_by]
+    inputs = [*run.scene_files, run.labels, *method_of(job).level_files[:2], *made_by]
     if config.viewpoints:
         inputs.append(config.viewpoints)
-    settings = asdict(config) | {"distance": fit.distance}
-    run_stage(job, "sample", settings, inputs, [run.viewpoints, run.sampled], make)
+    run_stage(job, "sample", asdict(config), inputs, [run.viewpoints, run.sampled], make)
 
 
 def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
@@ -113,13 +113,13 @@ def _until_it_stops_shrinking(
     table, errors = None, []
     for stop in stops:
         start = 0 if table is None else len(table.fidelity)
-        more = measured_levels(job, cameras[start:stop], fit)
+        more = measured_levels(job, cameras[start:stop])
         table = more if table is None else _joined(table, more)
         if stop == stops[-1]:
             break
         models = fit_fidelity(
-            table, cameras[:stop], job.scene.scale, fit.confidence, drawn.focal, drawn.rule.screens,
-            capture_cameras(job.scene),
+            table, job.cells, cameras[:stop], job.scene.scale, fit.confidence, drawn.focal,
+            drawn.rule.screens, capture_cameras(job.scene),
         )  # fmt: skip
         errors.append(float(np.mean([model.rmse for model in models.values()])))
         if len(errors) > 1 and errors[-1] > (1 - _SHRINKS) * errors[-2]:
@@ -134,19 +134,18 @@ def _until_it_stops_shrinking(
 
 
 def measured_levels(
-    job: Job, cameras: Sequence[Camera], fit: FitConfig, only: Collection[int] | None = None
+    job: Job, cameras: Sequence[Camera], only: Collection[int] | None = None
 ) -> SampledFidelity:
-    """Fidelity of the levels at some viewpoints, divided among those who compute.
+    """Fidelity of the cells' levels at some viewpoints, divided among those who compute.
 
-    `only`: ids of the categories that are measured; the others, and the whole image, are NaN. None: all.
+    `only`: ids of the cells that are measured; the others, and the whole image, are NaN. None: all.
     """
     parts = [(list(part), only) for part in split(cameras, job.pieces)]
     found = work_all(job, "sample", _measure_some, parts)
     fidelity, pixels, whole = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    labels = tuple(sorted({label for label, _ in job.ladder.counts}))
-    distance = distances_at(job.scene, job.point_labels, cameras, labels, fit.distance)
+    distance = look(job.cells, cameras).distance.astype(np.float32)
     image = np.array([camera.width * camera.height for camera in cameras], np.int32)
-    return SampledFidelity(labels, fidelity, pixels, image, whole, distance)
+    return SampledFidelity(tuple(job.cells.ids.tolist()), fidelity, pixels, image, whole, distance)
 
 
 def _measure_some(
@@ -154,7 +153,7 @@ def _measure_some(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     cameras, only = part
     return measure_levels(
-        job.ladder, cameras, only=only, full=job.came_in, backend=job.backend, antialiased=job.antialiased,
+        job.by_cell, cameras, only=only, full=job.came_in, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("sample", done, total)),
     )  # fmt: skip
 

@@ -211,9 +211,10 @@ def nest(
 
     Each step draws a prefix of every category, log-uniform between 3 % and all of it, or the full model (with
     a probability that rises from 0.1, in short trainings 0.3, to 0.9; a fifth of these steps draw prefixes
-    between 40 and 100 %). In half of the steps each cell has a prefix of its own instead. It compares the composition with a photo. Values are rounded as the increments will hold
-    them. The result is the mean of the last steps' values (at most 500 steps, or a fifth): prefixes pull in
-    different directions to the end. Gaussians outside the composition, and their Adam moments, stay as they
+    between 40 and 100 %). In half of the steps each cell has a prefix of its own instead. The composition is
+    compared with a photo. Values are rounded as the increments will hold them. The result is the
+    mean of the last steps' values (at most 500 steps, or a fifth): prefixes pull in different directions to
+    the end. Gaussians outside the composition, and their Adam moments, stay as they
     are. Prefixes are drawn with the opacities that they have, between the first and the second ones. At five
     steps all Gaussians are sorted again by importance: in each category the base model stays first.
 

@@ -266,7 +266,7 @@ def _sage(sage: Snapshots, targets: Sequence[float], share: float) -> list[Conte
     for target in targets:
         plan = sage.plan_scene(target, share)
         name = f"SSIM {target:g}, {plan.status}"
-        load = partial(ladder.compose, plan.levels)
+        load = partial(plan.compose, ladder)
         found.append(Contender(SAGE, name, ladder.levels[-1], load, target=target))
     return found
 
@@ -315,7 +315,7 @@ def _of_plan(nested: NestedLevels, name: str, plan: Plan) -> Contender:
     job = nested.job
     steps = job.last_level.step + settings_of(job.run, "nest")["steps"]
     return Contender(
-        PLANNED, name, steps, partial(job.ladder.compose, plan.levels),
+        PLANNED, name, steps, partial(plan.compose, job.ladder),
         {choice.label_id: choice.transfer_bytes or 0 for choice in plan.choices}, plan.target,
         np.nan if plan.budget is None else plan.budget,
     )  # fmt: skip

@@ -103,7 +103,7 @@ def cross_view(
     for row in views:
         for target in targets:
             plan = plan_for(row, target)
-            composed = measured(ladder.compose(plan.levels), row)
+            composed = measured(plan.compose(ladder), row)
             levels = {level: views_of[row] for level, views_of in at_level.items()}
             rows += _rows(plan, composed, levels, ladder)
     return from_rows(CrossView, rows)

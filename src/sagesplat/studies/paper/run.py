@@ -238,7 +238,7 @@ def _panels(job: Job, config: PaperConfig, view: int) -> dict[str, list[Picture]
     panels = {}
     for row in dict.fromkeys(rows):
         sets = {f"3DGS, {len(full):,}": full}
-        sets |= {f"t={p.target:g}, {p.count:,}": job.ladder.compose(p.levels) for p in _view_plans(job, row)}
+        sets |= {f"t={p.target:g}, {p.count:,}": p.compose(job.ladder) for p in _view_plans(job, row)}
         panels[job.scene.views[row].name] = take_pictures(
             job.photos[row], job.scene.views[row].camera, sets, metric,
             backend=job.backend, antialiased=job.antialiased,

@@ -82,7 +82,7 @@ def contenders(
     weights = importance(full, scene, scene.train_ids.tolist(), antialiased=antialiased)
     found = []
     for plan in plans:
-        composed = ladder.compose(plan.levels)
+        composed = plan.compose(ladder)
         sets = [
             composed,
             tuned(composed),
