@@ -6,14 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, quality_at
-from sagesplat.adapt.fidelity import distances_at, measure_compositions, shown_enough
+from sagesplat.adapt.bound_plans import Costs
+from sagesplat.adapt.cell_models import Expected, needed
+from sagesplat.adapt.cell_plans import reach
+from sagesplat.adapt.fidelity import SampledFidelity, shown_enough
 from sagesplat.adapt.fidelity_models import plan_nominal
-from sagesplat.adapt.viewpoint import where
 from sagesplat.adapt.viewpoints import capture_cameras, draw
 from sagesplat.run.job import Job
+from sagesplat.stages.fidelity import compositions_at
 from sagesplat.stages.methods import NestedLevels
-from sagesplat.stages.results import fidelity_of, plans_of, viewpoints_of
+from sagesplat.stages.results import plans_of, viewpoints_of
+from sagesplat.stages.sample import measured_levels
 
 TARGETS = (0.8, 0.9, 0.95, 0.98)
 MORE_TARGETS = (0.5, 0.6, 0.7, 0.75, 0.85, 0.97, 0.99)  # of the curve of plans over bytes
@@ -31,63 +34,48 @@ def measure(
     """Plan each target at fresh viewpoints, compose, measure; also scene plans, and equal levels.
 
     The viewpoints are drawn by the run's own rule with a seed that nothing was made with. Promises are scored
-    on the cheapest levels that they allow; `curve` is of plans as they are made (`plan_for_view`).
+    on the cheapest levels that they allow; `curve` is of plans as they are made (`plan_for_cells`).
     """
-    models, rule = fidelity_of(job), viewpoints_of(job).rule
+    rule, targets = viewpoints_of(job).rule, np.array(sorted((*TARGETS, *MORE_TARGETS)))
     fresh = replace(rule, seed=rule.seed + seed)
     cameras = draw(job.scene, capture_cameras(job.scene), fresh, {"test": views}).cameras
-    costs = NestedLevels(job).costs
-    labels, K, names = list(costs.labels), len(job.ladder.levels), job.names()
-    distance = distances_at(job.scene, job.point_labels, cameras, labels, job.fit_config.distance)
-    targets = np.array(sorted((*TARGETS, *MORE_TARGETS)))
-    J = len(targets)
-    planned = plan_nominal(models, labels, K, distance, cameras, targets)
-    equal = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (views, K, len(labels)))
+    method, names, J, K = NestedLevels(job), job.names(), len(targets), len(job.ladder.levels)
+    labels, costs = list(method.costs.labels), method.cell_costs
+    expected = method.expect(cameras)
+    planned = plan_nominal(method.fidelity, expected, costs.transfer_bytes, targets)
     whole_scene = [plan for plan in plans_of(job) if plan.quality == "fidelity"]
-    scenes = np.array([[plan.levels[label] for label in labels] for plan in whole_scene])
-    scenes = np.broadcast_to(scenes.reshape(1, -1, len(labels)), (views, len(whole_scene), len(labels)))
-
-    def measured(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return measure_compositions(
-            job.ladder, cameras, levels, backend=job.backend, antialiased=job.antialiased, progress=progress
-        )
-
-    found, pixels = measured(np.concatenate([planned, equal, scenes], 1))
-    shown = shown_enough(pixels, cameras)
-    far = dict(zip(labels, distance.T.astype(np.float64), strict=True))
-    quality = quality_at(costs, models, far, cameras, "fidelity")
-    filled = np.array(
-        [[made(quality, costs, t, v, pixels[v], labels) for t in targets] for v in range(views)]
-    )
-    by_plan, _ = measured(filled)
-    promised = _promised(models, labels, distance, cameras)
-    counted = [names[label] for label in labels]
+    scenes = np.array([[plan.levels[i] for i in job.cells.labels.tolist()] for plan in whole_scene])
+    scenes = np.broadcast_to(scenes[None], (views, *scenes.shape))
+    filled = method.planned_cells(expected, cameras, targets.tolist())
+    asked = np.concatenate([planned, _equal(job, views), scenes, filled], 1)
+    found, pixels = compositions_at(job, cameras, asked, "promises")
+    if progress:
+        progress(views, views)
+    shown, promised = shown_enough(pixels, cameras), np.isfinite(needed(method.fidelity, expected, 0.9))
+    equal, counted = found[:, J : J + K, :-1], [names[label] for label in labels]
+    models = [label in method.fidelity for label in labels]
+    after = J + K + len(whole_scene)
+    sent = [_bytes(costs, levels) for levels in (filled, scenes)]
+    level_bytes = method.costs.transfer_bytes.sum(0)
     return {
         "views": views,
-        "categories": {names[label]: models[label].status for label in labels if label in models},
+        "categories": {names[label]: model.status for label, model in method.fidelity.items()},
         "targets": {
-            f"{target:g}": _coverage(
-                target, planned[:, j] - 1, found[:, j, :-1], found[:, J : J + K, :-1],
-                shown & promised, counted,
-            )
+            f"{target:g}": _coverage(target, found[:, j, :-1], equal, shown & promised, counted)
             for j, target in enumerate(targets)
         },
         "scene_plans": {
             f"{plan.target:g}": _coverage(
-                plan.target, scenes[:, j] - 1, found[:, J + K + j, :-1], found[:, J : J + K, :-1],
-                shown & [label in models for label in labels], counted,
+                plan.target, found[:, J + K + j, :-1], equal, shown & models, counted
             )
             for j, plan in enumerate(whole_scene)
         },
         "curve": _curve(
-            np.concatenate([by_plan, found[:, J : J + K]], 1), shown,
-            costs.transfer_bytes[np.arange(len(labels)), filled - 1].sum(2), targets,
-            costs.transfer_bytes.sum(0),
+            np.concatenate([found[:, after:], found[:, J : J + K]], 1), shown, sent[0], targets, level_bytes
         ),
         "scene_curve": _curve(
-            np.concatenate([found[:, J + K :], found[:, J : J + K]], 1), shown,
-            costs.transfer_bytes[np.arange(len(labels)), scenes - 1].sum(2),
-            np.array([plan.target for plan in whole_scene]), costs.transfer_bytes.sum(0),
+            np.concatenate([found[:, J + K : after], found[:, J : J + K]], 1), shown, sent[1],
+            np.array([plan.target for plan in whole_scene]), level_bytes,
         ),
     }  # fmt: skip
 
@@ -95,78 +83,72 @@ def measure(
 def by_condition(job: Job, views: int = 200, seed: int = 91_000) -> dict[str, Any]:
     """The targets by condition: kept, excess, share that has a promise, MB of plans and of a perfect planner.
 
-    The perfect planner takes the cheapest level that measures the target, all categories at one level.
+    The perfect planner knows the fidelity of every cell at every level, all at one, and takes the levels of
+    the fewest bytes by which each category reaches the target.
     """
-    models, rule = fidelity_of(job), viewpoints_of(job).rule
-    costs, names = NestedLevels(job).costs, job.names()
-    labels, K = list(costs.labels), len(job.ladder.levels)
-    targets, found = np.array(TARGETS), {}
+    method, rule, names = NestedLevels(job), viewpoints_of(job).rule, job.names()
+    labels, costs, targets, found = list(method.costs.labels), method.cell_costs, np.array(TARGETS), {}
     for name, (places, screen) in CONDITIONS.items():
         drawn = replace(rule, seed=rule.seed + seed, places=places, screens=(screen, screen))
         cameras = draw(job.scene, capture_cameras(job.scene), drawn, {"test": views}).cameras
-        distance = distances_at(job.scene, job.point_labels, cameras, labels, job.fit_config.distance)
-        far = dict(zip(labels, distance.T.astype(np.float64), strict=True))
-        planned = plan_nominal(models, labels, K, distance, cameras, targets)
-        equal = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (views, K, len(labels)))
-        got, pixels = measure_compositions(
-            job.ladder, cameras, np.concatenate([planned, equal], 1), backend=job.backend,
-            antialiased=job.antialiased,
-        )  # fmt: skip
-        quality = quality_at(costs, models, far, cameras, "fidelity")
-        shown = shown_enough(pixels, cameras) & [label in models for label in labels]
-        promised = _promised(models, labels, distance, cameras)
+        expected = method.expect(cameras)
+        planned = plan_nominal(method.fidelity, expected, costs.transfer_bytes, targets)
+        got, pixels = compositions_at(
+            job, cameras, np.concatenate([planned, _equal(job, views)], 1), "promises"
+        )
+        filled = method.planned_cells(expected, cameras, targets.tolist())
+        best = _perfect(measured_levels(job, cameras), expected, costs, targets)
+        shown = shown_enough(pixels, cameras) & [label in method.fidelity for label in labels]
+        promised = np.isfinite(needed(method.fidelity, expected, 0.9))
         rows = {}
         for j, target in enumerate(TARGETS):
             row = _coverage(
-                target, planned[:, j] - 1, got[:, j, :-1], got[:, len(targets) :, :-1], shown & promised,
+                target, got[:, j, :-1], got[:, len(targets) :, :-1], shown & promised,
                 [names[label] for label in labels],
             )  # fmt: skip
-            levels = np.array([made(quality, costs, target, v, pixels[v], labels) for v in range(views)])
-            best = np.where(shown, (got[:, len(targets) :, :-1] >= target).argmax(1), 0)
-            sent, least = (
-                float(costs.transfer_bytes[np.arange(len(labels)), taken].sum(1).mean()) / 1e6
-                for taken in (levels - 1, best)
-            )
-            row |= {"promised": float(promised[shown].mean()), "mb": sent, "perfect_mb": least}
-            rows[f"{target:g}"] = row
+            sent, least = (float(_bytes(costs, taken)[:, j].mean()) / 1e6 for taken in (filled, best))
+            rows[f"{target:g}"] = row | {
+                "promised": float(promised[shown].mean()), "mb": sent, "perfect_mb": least,
+            }  # fmt: skip
         found[name] = rows
     return found
 
 
-def made(
-    quality: Quality, costs: Costs, target: float, view: int, pixels: np.ndarray, labels: Sequence[int]
-) -> list[int]:
-    """The levels of the plan of a viewpoint."""
-    plan = plan_for_view(quality, costs, target, view, pixels.astype(np.float64))
-    return [plan.levels[label] for label in labels]
+def _equal(job: Job, views: int) -> np.ndarray:
+    """Compositions with all cells at one level, [V, K, C]."""
+    K, C = len(job.ladder.levels), len(job.cells.ids)
+    return np.broadcast_to(np.arange(1, K + 1)[None, :, None], (views, K, C))
 
 
-def _promised(models, labels, distance, cameras):  # type: ignore[no-untyped-def]
-    """Whether a bound is given, bool [V, L]: inside the support, of a category with a model."""
-    given = np.zeros((len(cameras), len(labels)), bool)
-    for column, label in enumerate(labels):
-        if label in models:
-            predicted = models[label].predict(
-                distance[:, column].astype(np.float64), *where(cameras, models[label].focal)
-            )
-            given[:, column] = np.isfinite(predicted.bound).any(1)
-    return given
+def _bytes(costs: Costs, levels: np.ndarray) -> np.ndarray:
+    """Bytes to send of compositions [V, J, C], as [V, J]."""
+    return costs.transfer_bytes[np.arange(levels.shape[2]), levels - 1].sum(2)
+
+
+def _perfect(known: SampledFidelity, expected: Expected, costs: Costs, targets: np.ndarray) -> np.ndarray:
+    """Levels [V, J, C] of a planner that knows the cells' pixels and what they measure."""
+    V, C = known.pixels.shape
+    found = np.ones((V, len(targets), C), int)
+    for row in range(V):
+        share = known.pixels[row] / known.image[row]
+        mean = np.maximum.accumulate(np.nan_to_num(known.fidelity[row].astype(np.float64)), 1)
+        for j, target in enumerate(targets):
+            asked = np.full(len(expected.labels), target)
+            found[row, j] += reach(costs.transfer_bytes, mean, share, expected.column, asked).levels
+    return found
 
 
 def _coverage(
-    target: float, taken: np.ndarray, got: np.ndarray, uniform: np.ndarray, counts: np.ndarray,
-    names: Sequence[str],
+    target: float, got: np.ndarray, uniform: np.ndarray, counts: np.ndarray, names: Sequence[str]
 ) -> dict[str, Any]:  # fmt: skip
-    """Coverage of one target, and the excess beside that of a perfect planner.
+    """Coverage of one target, and the excess beside that of equal levels, each category at its best one.
 
-    `taken` [V, L]: levels; `got` [V, L]; `uniform` [V, K, L]: with all categories at one level; `counts`
-    [V, L]: decisions that are scored. `beyond`: how far the level below the one taken is above the target.
+    `got` [V, L]; `uniform` [V, K, L]: with all categories at one level; `counts` [V, L]: decisions that are
+    scored.
     """
     kept = (got >= target) & counts
     best = (uniform >= target).argmax(1)
     perfect = np.take_along_axis(uniform, best[:, None], 1)[:, 0]
-    below = np.take_along_axis(uniform, np.maximum(taken - 1, 0)[:, None], 1)[:, 0]
-    beyond = np.where(taken > 0, np.maximum(below - target, 0), 0)
     by_view = kept.sum(1), counts.sum(1)
     rng = np.random.default_rng(0)
     draws = rng.integers(len(got), size=(_DRAWS, len(got)))
@@ -182,7 +164,6 @@ def _coverage(
         "interval": np.quantile(spread, [0.025, 0.975]).tolist(),
         "excess": float((got - target)[counts].mean()),
         "perfect": float((perfect - target)[counts].mean()),
-        "beyond_step": float(beyond[counts].mean()),
         "by_category": by_category,
     }
 
@@ -234,8 +215,7 @@ def lines(name: str, result: dict[str, Any]) -> list[str]:
             worst = _worst(row, result["categories"])
             out.append(
                 f"  {target:>5}: kept {row['kept']:.3f} [{low:.3f}, {high:.3f}] of {row['decisions']}, "
-                f"excess {row['excess']:.4f} (perfect {row['perfect']:.4f}, beyond the step "
-                f"{row['beyond_step']:.4f}); worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
+                f"excess {row['excess']:.4f} (perfect {row['perfect']:.4f}); worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
             )
     for target, row in result["scene_plans"].items():
         worst = _worst(row, result["categories"])

@@ -66,25 +66,6 @@ def test_statuses():
     assert (nothing.status, set(nothing.levels.values())) == ("no promise", {3})
 
 
-def test_fidelity_is_filled_with_pixels_and_ssim_is_not():
-    bound = [[0.1, 0.2, 0.8], [0.6, 0.7, 0.8], [0.6, 0.7, 0.8]]
-    pixels = np.array([100.0, 900.0, 0.0])
-    assert plan_for_view(quality(MEAN, bound), COSTS, 0.6, 0).levels == {3: 3, 7: 1, 9: 1}
-    assert plan_for_view(quality(MEAN, bound), COSTS, 0.6, 0, pixels).levels == {3: 3, 7: 2, 9: 1}
-    assert plan_for_view(quality(MEAN, bound, "ssim"), COSTS, 0.6, 0, pixels).levels == {3: 3, 7: 1, 9: 1}
-
-
-def test_what_nobody_sees_costs_little():
-    """A category that is not in the picture has no bound there: it does not get its highest level."""
-    bound, pixels = [NAN, MEAN[1], NAN], np.array([0.0, 900.0, 5.0])
-    plan = plan_for_view(quality(MEAN, bound, "ssim"), COSTS, 0.4, 0, pixels)
-    unseen, seen, lost = plan.choices
-    assert (unseen.level, unseen.status, unseen.calibrated) == (2, "ok", None)
-    assert math.isnan(unseen.predicted)  # nothing is promised
-    assert (seen.level, seen.status, seen.calibrated) == (1, "ok", True)
-    assert (lost.level, lost.status, lost.calibrated) == (3, "no promise", None)
-
-
 @pytest.mark.parametrize(("kind", "name"), [("fidelity", "target fidelity"), ("ssim", "target SSIM")])
 @pytest.mark.parametrize("target", [0.0, -1.0, 1.5, math.nan])
 def test_impossible_targets_are_one_line(kind, name, target):

@@ -54,27 +54,14 @@ def test_critical_margins_by_trying_all(seed, levels):
 
 
 def test_critical_nominals_between_compositions():
-    bound = np.array([[0.3, 0.5, 0.7, 0.9, 1.0]])
     nominal = np.array([0.4, 0.6, 0.8, 0.95])
-    taken = np.array([[1, 2, 3, 4]])
 
     def critical(measured, target=0.6):
-        return critical_nominals(bound, nominal, taken, np.array([measured]), target)[0]
+        return critical_nominals(nominal, np.array([measured]), target)[0]
 
-    assert critical([0.5, 0.7, 0.8, 1.0]) == 0.5  # level 1 misses, the next one keeps
-    assert critical([0.5, 0.55, 0.8, 1.0]) == 0.7
-    assert critical([0.7, 0.75, 0.8, 1.0]) == 0.3  # levels below the first composition count as missed
-    assert critical([0.7, 0.5, 0.8, 1.0]) == 0.7  # one that keeps below one that misses does not count
+    assert critical([0.5, 0.7, 0.8, 1.0]) == pytest.approx(0.5)  # half of the way from what misses
+    assert critical([0.5, 0.55, 0.8, 1.0]) == pytest.approx(0.64)
+    assert critical([0.7, 0.75, 0.8, 1.0]) == 0.4  # nothing is known below the first one
+    assert critical([0.7, 0.5, 0.8, 1.0]) == pytest.approx(0.6 + 0.2 / 3)  # what keeps below what misses
     assert critical([0.1, 0.2, 0.3, 0.4]) == 1.0  # nothing but the full model
-    assert critical([0.7, 0.75, 0.8, 1.0], 0.05) == 0.3
-    lowest = critical_nominals(bound, nominal, np.array([[0, 2, 3, 4]]), np.array([[0.7, 0.8, 0.9, 1]]), 0.6)
-    assert lowest[0] == -np.inf
-
-
-def test_levels_that_no_composition_took_are_interpolated():
-    bound = np.array([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]])
-    found = critical_nominals(bound, np.array([0.05, 0.55]), np.array([[0, 5]]), np.array([[0.0, 1.0]]), 0.5)
-    assert found[0] == bound[0, 2]  # 0, .2, .4 miss
-    # the same level twice: its neighbours made the difference, and the second nominal target is needed
-    same = critical_nominals(bound, np.array([0.4, 0.45]), np.array([[4, 4]]), np.array([[0.4, 0.7]]), 0.5)
-    assert same[0] == pytest.approx(0.45)
+    assert critical([0.5, 0.5, 0.6, 0.6]) == pytest.approx(0.8)

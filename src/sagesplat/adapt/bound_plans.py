@@ -133,12 +133,13 @@ def plan_for_cells(
         RunError: For an impossible target.
     """
     check_target(target, "fidelity")
-    mean, share = expected.mean[view], expected.share[view]
-    least = needed(models, expected, target)[view]
-    found = reach(costs.transfer_bytes, mean, share, expected.column, least)
+    here = expected.at(view)
+    mean, share = here.mean[0], here.share[0]
+    least = needed(models, here, target)[0]
+    found = reach(costs.transfer_bytes, mean, share, here.column, least)
     levels = fill(found.levels, mean, costs.transfer_bytes, share)
-    bound = promised(models, expected, expected.of_composition(np.tile(levels + 1, (len(expected.share), 1))))
-    shown = expected.category_shares()[view] > 0
+    bound = promised(models, here, here.of_composition(levels[None] + 1))[0]
+    shown = here.category_shares()[0] > 0
     choices = []
     for column, label in enumerate(expected.labels.tolist()):
         mine = np.flatnonzero(expected.column == column)
@@ -153,12 +154,12 @@ def plan_for_cells(
             Choice(
                 label_id=label,
                 level=int(levels[mine].max()) + 1,
-                predicted=float(bound[view, column]),
+                predicted=float(bound[column]),
                 distance=float(quality.distance[view, column]),
                 count=int(taken[0].sum()),
                 status=status,
                 transfer_bytes=int(taken[1].sum()),
-                calibrated=bool(quality.calibrated[column]) if np.isfinite(bound[view, column]) else None,
+                calibrated=bool(quality.calibrated[column]) if np.isfinite(bound[column]) else None,
             )
         )
     cells = dict(zip(costs.labels, (levels + 1).tolist(), strict=True))

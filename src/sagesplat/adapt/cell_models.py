@@ -15,7 +15,7 @@ direction and screen to the nearest known view; below `least_support` nothing is
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +102,12 @@ class Expected:
     share: Float[np.ndarray, "V C"]  # of the picture's pixels; 0: out of sight
     support: Float[np.ndarray, "V L"]  # NaN without a model
     away: Float[np.ndarray, " V"]  # 0 at a photo, 1 far from all
+
+    def at(self, view: int) -> "Expected":
+        """What is expected from one of the viewpoints."""
+        one = slice(view, view + 1)
+        arrays = {name: getattr(self, name)[one] for name in ("mean", "share", "support", "away")}
+        return replace(self, **arrays)
 
     def category_shares(self) -> Float[np.ndarray, "V L"]:
         """Share of the picture's pixels of each category."""

@@ -64,7 +64,7 @@ def trial(models: Mapping[int, FidelityModel], compositions: "Compositions") -> 
     planned = plan_nominal(models, expected, cell_costs(job).transfer_bytes, NOMINAL)
     fidelity, pixels = compositions.measure(planned)
     shown = shown_enough(pixels, cameras)
-    return Trial(expected.labels.tolist(), shown, expected.support, fidelity)
+    return Trial(expected.labels.tolist(), shown, expected.support, fidelity[..., :-1])
 
 
 def cell_costs(job: Job) -> Costs:
@@ -111,7 +111,9 @@ def compositions_at(
     stage: str,
     only: Collection[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fidelity [V, J, L] of categories in compositions of cells (levels [V, J, C]), and their pixels [V, L].
+    """Fidelity [V, J, L + 1] of compositions of cells (levels [V, J, C]), and pixels of categories [V, L].
+
+    The last column is the whole image, NaN where not all cells are wanted.
 
     It is divided among all who compute. `only`: ids of the cells that are measured; None: all.
     """
@@ -120,7 +122,8 @@ def compositions_at(
     found = work_all(job, stage, _measure_some, parts)
     fidelity, pixels = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     member = job.cells.labels[:, None] == np.unique(job.cells.labels)
-    return pooled_cells(fidelity[..., :-1], pixels, member), (pixels @ member).astype(np.int32)
+    of_labels = pooled_cells(fidelity[..., :-1], pixels, member)
+    return np.concatenate([of_labels, fidelity[..., -1:]], 2), (pixels @ member).astype(np.int32)
 
 
 def _measure_some(

@@ -106,9 +106,10 @@ class NestedLevels(Method):
     @cached_property
     def _expected(self) -> Expected:
         """What every view of the scene is expected to see of the cells."""
-        return self._expect([view.camera for view in self.job.scene.views])
+        return self.expect([view.camera for view in self.job.scene.views])
 
-    def _expect(self, cameras: Sequence[Camera]) -> Expected:
+    def expect(self, cameras: Sequence[Camera]) -> Expected:
+        """What cameras are expected to see of the cells."""
         return expect(self.fidelity, self.job.cells, cameras, len(self.job.ladder.levels))
 
     def _of_cells(self, expected: Expected, cameras: Sequence[Camera]) -> Quality:
@@ -184,10 +185,21 @@ class NestedLevels(Method):
             far = distances_from(self.job, camera)
             found = quality_at(self.costs, self.promises, far, [camera], quality)
             return replace(plan_for_view(found, self.costs, target, 0), view=None)
-        expected = self._expect([camera])
+        expected = self.expect([camera])
         found = self._of_cells(expected, [camera])
         plan = plan_for_cells(self.fidelity, expected, found, self.cell_costs, target, 0)
         return replace(plan, view=None)
+
+    def planned_cells(
+        self, expected: Expected, cameras: Sequence[Camera], targets: Sequence[float]
+    ) -> np.ndarray:
+        """Levels of the cells in the plans for fidelity at cameras, [V, J, C]."""
+        quality, costs = self._of_cells(expected, cameras), self.cell_costs
+        plans = [
+            [plan_for_cells(self.fidelity, expected, quality, costs, target, row) for target in targets]
+            for row in range(len(cameras))
+        ]
+        return np.array([[list((plan.cells or {}).values()) for plan in of_view] for of_view in plans])
 
     def plan_scene(self, target: float, share: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
@@ -222,7 +234,7 @@ class NestedLevels(Method):
         fidelity, pixels = compositions_at(self.job, cameras, planned, "plan")
         shown = shown_enough(pixels, cameras)
         shown &= np.array(self.costs.labels) != UNLABELLED
-        return np.where(shown[:, None], fidelity, np.nan).astype(np.float64)
+        return np.where(shown[:, None], fidelity[..., :-1], np.nan).astype(np.float64)
 
     def plan_budget(self, config: PlanConfig) -> Plan:
         """See `Method`."""

@@ -202,7 +202,8 @@ def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
     run = job.run
     if not (run.ladder == "nested" and run.sampled.exists() and run.fidelity.exists()):
         return None, {}
-    models, sets, sampled = fidelity_of(job), viewpoints_of(job), sampled_of(job)
+    models, sets = fidelity_of(job), viewpoints_of(job)
+    sampled = sampled_of(job).by_label(job.cells.label_of)
     confidence = min((model.confidence for model in models.values()), default=0.0)
     fitted, composed, calibration = (len(sets.rows(name)) for name in SETS)
     facts = PromiseFacts(confidence, fitted, composed, calibration, in_words(sets))
