@@ -62,6 +62,7 @@ def cases() -> list[Case]:
         case("degree 1, an empty level", waves(20, 1), [6, 6, 20]),
         case("degree 2, other steps", waves(24, 2), [24], Precision(1 / 30, 3, 1.3, 0.07, (6, 5), 2.0, 0.5)),
         case("degree 3, several blocks", waves(60, 3), [1, 20, 60]),
+        case("degree 1, many blocks", waves(210, 1), [8, 20, 70, 210]),
         case("escapes", far_off(20), [4, 20], replace(OLD, log_scale=0.05, sh_bits=(8, 8))),
         case("none", waves(0, 3), [0]),
         case("two opacities", waves(60, 1), [3, 20, 45, 60], Precision(), (0.0, 0.0, 0.4, 1.0)),

@@ -1,10 +1,38 @@
 /** How fast coded streams are decoded to what the GPU reads. */
 
+import { HEADER_BYTES, readHeader } from "../src/core/header";
 import { StreamDecoder } from "../src/core/stream";
 import { Packing } from "../src/view/packing";
 
+/** The streams of a file, which lie one after the other. */
+export function streamsOf(file: Uint8Array): Uint8Array[] {
+  const found: Uint8Array[] = [];
+  let at = 0;
+  const number = () => {
+    let value = 0;
+    for (let shift = 0; ; shift += 7) {
+      const byte = file[at++] as number;
+      value |= (byte & 127) << shift;
+      if (byte < 128) return value;
+    }
+  };
+  while (at < file.length) {
+    const start = at;
+    const { levels, twoOpacities } = readHeader(file.subarray(at));
+    at += HEADER_BYTES;
+    for (let level = 0; level < levels; level++) {
+      number();
+      const size = number(); // before `at` is read: it moves
+      at += Number(twoOpacities) + size;
+    }
+    found.push(file.subarray(start, at));
+  }
+  return found;
+}
+
 /** Millions of Gaussians a second: of the first round, the best one and the median. */
-export function decodeSpeed(streams: readonly Uint8Array[], rounds: number): Record<string, number> {
+export function decodeSpeed(files: readonly Uint8Array[], rounds: number): Record<string, number> {
+  const streams = files.flatMap(streamsOf);
   const times: number[] = [];
   let count = 0;
   for (let round = 0; round < rounds; round++) {

@@ -48,7 +48,7 @@ MAX_COUNT = 10_000_000  # Gaussians of a stream
 _MAX_LEVELS = 255
 _FARTHEST = 1e17  # positions, world units
 _PER_BYTE = 128  # Gaussians in a byte, at most: what the least frequencies of the tables allow is 97
-_SMALLEST, _LARGEST = 4, 11  # log2 of the Gaussians of a block
+_SMALLEST, _LARGEST = 5, 11  # log2 of the Gaussians of a block
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ BITS = 14
 TOTAL = 1 << BITS  # of the frequencies of a table
 LOWEST = 1 << 23  # state
 COUNTED = 128  # what a symbol adds to its count
+RENEWED = 4  # of a row's counts, the part that has to be new before its frequencies are
 MOST = 1 << 18
 
 
@@ -45,8 +46,9 @@ class Tables:
     def __init__(self, weights: dict[str, np.ndarray]) -> None:
         self.counts = {name: weight.astype(np.int64) for name, weight in weights.items()}
         self.ends = {name: np.zeros((len(w), w.shape[1] + 1), np.int64) for name, w in weights.items()}
+        self._new = {name: np.full(len(w), MOST, np.int64) for name, w in weights.items()}
         for name, counts in self.counts.items():
-            _refresh(counts, self.ends[name], np.ones(len(counts), np.bool_))
+            _refresh(counts, self.ends[name], self._new[name])
         self._seen: list[tuple[str, np.ndarray, np.ndarray]] = []
 
     def saw(self, name: str, contexts: np.ndarray, symbols: np.ndarray) -> None:
@@ -54,12 +56,11 @@ class Tables:
         self._seen.append((name, contexts, symbols))
 
     def end_block(self) -> None:
-        """Count the symbols of the block, and renew the frequencies of the rows that have some."""
-        touched = {name: np.zeros(len(self.counts[name]), np.bool_) for name, _, _ in self._seen}
+        """Count the symbols of the block, and renew the frequencies of rows that have enough of new ones."""
         for name, contexts, symbols in self._seen:
-            _count(self.counts[name], touched[name], contexts, symbols)
-        for name, rows in touched.items():
-            _refresh(self.counts[name], self.ends[name], rows)
+            _count(self.counts[name], self._new[name], contexts, symbols)
+        for name in {name for name, _, _ in self._seen}:
+            _refresh(self.counts[name], self.ends[name], self._new[name])
         self._seen = []
 
 
@@ -136,19 +137,21 @@ class Reader:
 
 
 @njit(cache=True)
-def _count(counts, touched, contexts, symbols):  # pragma: no cover - compiled
+def _count(counts, new, contexts, symbols):  # pragma: no cover - compiled
     for i in range(len(contexts)):
         counts[contexts[i], symbols[i]] += COUNTED
-        touched[contexts[i]] = True
+        new[contexts[i]] += 1
 
 
 @njit(cache=True)
-def _refresh(counts, ends, rows):  # pragma: no cover - compiled
+def _refresh(counts, ends, new):  # pragma: no cover - compiled
     """Frequencies by counts, at least 1 where a count is not 0; the first largest gets what is left."""
     for row in range(len(counts)):
-        if not rows[row]:
-            continue
         count = counts[row]
+        more = new[row] * COUNTED
+        if not more or more * RENEWED < count.sum() - more:
+            continue
+        new[row] = 0
         while count.sum() > MOST:
             for s in range(len(count)):
                 count[s] = (count[s] + 1) >> 1

@@ -83,8 +83,8 @@ def _ranges(folder: Path) -> list[dict[str, Any]]:
     part = CHUNK | {"uri": "sky-0.sgst"}
     return [
         part
-        | {"cell": 2 + i, "level": k, "count": k, "nbytes": high - low, "offset": start + low, "weight": w}
-        for i, start in enumerate((0, len(coded.content)))
+        | {"cell": cell, "level": k, "count": k, "nbytes": high - low, "offset": start + low, "weight": w}
+        for cell, start in ((2, 0), (5, len(coded.content)))
         for k, (low, high), w in zip((1, 2), pairwise((0, *coded.ends)), coded.weights, strict=False)
     ]
 

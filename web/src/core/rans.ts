@@ -4,6 +4,7 @@ const BITS = 14;
 const TOTAL = 1 << BITS; // of the frequencies of a row
 const LOWEST = 2 ** 23; // state
 const COUNTED = 128; // what a symbol adds to its count
+const RENEWED = 4; // of a row's counts, the part that has to be new before its frequencies are
 const MOST = 2 ** 18; // sum of counts beyond which they are halved
 const PIECE = 6; // bits of a slot that the index of symbols leaves out,
 const FEW_PIECE = 8; // and those for
@@ -17,8 +18,8 @@ export class Table {
   readonly slots: Int32Array; // [rows, symbols]: the first slot of a symbol, and its frequency << 14
   readonly index: Uint8Array; // [rows, 2^(14 - piece)]: the symbol of every 2^piece-th slot
   readonly piece: number;
-  readonly used: Int32Array; // symbols of each row that were read in this block
-  readonly sums: Int32Array; // of the counts of a row
+  readonly used: Int32Array; // symbols of each row that were read since its frequencies were renewed
+  readonly sums: Int32Array; // of the counts of a row then
   readonly possible: Int32Array; // symbols of a row that can occur,
   readonly lows: Int32Array; // the first of them,
   readonly highs: Int32Array; // and where they end, in `counts`
@@ -63,12 +64,12 @@ export class Table {
     [this.sums[row], this.possible[row], this.lows[row], this.highs[row]] = [sum, possible, low, high];
   }
 
-  /** Renews the frequencies of the rows that were used. */
+  /** Renews the frequencies of the rows that have enough of new symbols. */
   endBlock(): void {
     const { used, sums, rows } = this;
     for (let row = 0; row < rows; row++) {
       const more = used[row] as number;
-      if (!more) continue;
+      if (!more || RENEWED * COUNTED * more < (sums[row] as number)) continue;
       used[row] = 0;
       sums[row] = (sums[row] as number) + COUNTED * more;
       this.renew(row);

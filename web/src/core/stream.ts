@@ -6,7 +6,7 @@ import { Reader } from "./rans";
 
 const MAX_COUNT = 10_000_000;
 const PER_BYTE = 128; // Gaussians in a byte, at most
-const SMALLEST = 16; // Gaussians of a block: a power of two
+const SMALLEST = 32; // Gaussians of a block: a power of two
 const ALL_SECOND = 255; // weight of a level whose Gaussians have one opacity, which counts as both
 
 /** Makes of a stream's Gaussians what a caller wants of a level. */
