@@ -54,14 +54,13 @@ def test_critical_margins_by_trying_all(seed, levels):
 
 
 def test_critical_nominals_between_compositions():
-    nominal = np.array([0.4, 0.6, 0.8, 0.95])
+    nominal, bound = np.array([0.4, 0.6, 0.8, 0.95]), np.array([[0.5, 0.62, 0.8, 1.0]])
 
     def critical(measured, target=0.6):
-        return critical_nominals(nominal, np.array([measured]), target)[0]
+        return critical_nominals(nominal, bound, np.array([measured]), target)[0]
 
-    assert critical([0.5, 0.7, 0.8, 1.0]) == pytest.approx(0.5)  # half of the way from what misses
-    assert critical([0.5, 0.55, 0.8, 1.0]) == pytest.approx(0.64)
+    assert critical([0.5, 0.7, 0.8, 1.0]) == pytest.approx(0.56)  # half of the way from what misses
+    assert critical([0.5, 0.55, 0.8, 1.0]) == pytest.approx(0.62 + 0.2 * 0.18)
     assert critical([0.7, 0.75, 0.8, 1.0]) == 0.4  # nothing is known below the first one
-    assert critical([0.7, 0.5, 0.8, 1.0]) == pytest.approx(0.6 + 0.2 / 3)  # what keeps below what misses
+    assert critical([0.7, 0.5, 0.8, 1.0]) == pytest.approx(0.68)  # what keeps below what misses counts not
     assert critical([0.1, 0.2, 0.3, 0.4]) == 1.0  # nothing but the full model
-    assert critical([0.5, 0.5, 0.6, 0.6]) == pytest.approx(0.8)

@@ -26,11 +26,11 @@ from sagesplat.core.errors import DataError
 from sagesplat.scene.scene import Camera
 
 LABELS, K = (3, 7), 8
-AHEAD = np.array([[-2.0, 0, 5], [2, 0, 5], [-2, 1, 6], [2, 1, 6]])  # a cell at each: two of each category
+AHEAD = np.array([[6.0, 3, 5], [8, 3, 5], [6, 4, 6], [8, 4, 6]])  # a cell at each: two of each category
 GRID = np.zeros((4, POINTS, 4), np.uint8)
 GRID[:, 0, 3] = STEPS
 CELLS = Cells(
-    np.arange(4), np.repeat(LABELS, 2), np.tile(AHEAD, 2), GRID, np.array([1.0, 3.0, 2.0, 2.0]), np.ones(4)
+    np.arange(4), np.repeat(LABELS, 2), np.tile(AHEAD, 2), GRID, np.array([4e3, 9e3, 6e3, 6e3]), np.ones(4)
 )  # fmt: skip
 COST = np.tile(np.arange(1, K + 1) * 100, (4, 1))
 PIXELS = 50 // 2  # of each cell
@@ -86,7 +86,9 @@ def trial(models, cameras: list[Camera], seed: int, spill: float = 0.0, shown=No
     planned = plan_nominal(models, expected, COST, NOMINAL)
     shown = np.ones((len(cameras), 2), bool) if shown is None else shown
     measured = by_category(truth(cameras, planned, seed, spill))
-    return Trial(LABELS, shown, expected.support, measured)
+    composed = [expected.of_composition(planned[:, j]) for j in range(len(NOMINAL))]
+    bound = np.stack([promised(models, expected, mean) for mean in composed], 1)
+    return Trial(LABELS, shown, expected.support, bound, measured)
 
 
 def fitted(table: SampledFidelity, cameras: list[Camera], confidence: float = 0.95):
@@ -126,19 +128,19 @@ def test_every_target_of_every_category_is_kept_at_new_viewpoints(confidence):
         assert of_each.min() > confidence - 0.04, target
         assert of_each.max() < 1 if target < 0.97 else True
         # beside the lowest equal levels that measure the target
-        assert np.mean(wasted[target]) < 0.035
+        assert np.mean(wasted[target]) < 0.05
 
 
 def test_a_category_that_neighbours_spoil_holds_them():
     seed = 1
     without, nothing = made(seed)
     assert not nothing.any()
-    models, held = made(seed, spill=0.15)
+    models, held = made(seed, spill=0.3)
     assert held.any()
     fresh = viewpoints(300, 77)
     for target in (0.7, 0.8, 0.9):
         got, naive = (
-            by_category(truth(fresh, planned_at(some, fresh, target), 78, spill=0.15))[:, 0]
+            by_category(truth(fresh, planned_at(some, fresh, target), 78, spill=0.3))[:, 0]
             for some in (models, without)
         )
         assert (got >= target).mean(0).min() > 0.9

@@ -55,10 +55,10 @@ def test_slopes_of_the_likelihood():
     x, u, values = drawn()
     for shift in (-0.5, 0.0, 0.4):
         theta = PRIOR + shift
-        slope = _cost(theta, squares_of(x), u, values)[1]
+        slope = _cost(theta, [(squares_of(x), u, values)])[1]
         for i in range(6):
             step = 1e-6 * (np.arange(6) == i)
-            up, down = (_cost(theta + sign * step, squares_of(x), u, values)[0] for sign in (1, -1))
+            up, down = (_cost(theta + sign * step, [(squares_of(x), u, values)])[0] for sign in (1, -1))
             # the amplitude's own dependence on theta adds nothing but for the floor under it
             assert slope[i] == pytest.approx((up - down) / 2e-6, rel=0.02, abs=0.02)
 
@@ -68,10 +68,10 @@ def test_hyperparameters_are_the_best_near_by_and_within_bounds():
     process = fit_process(x, u, values)
     theta = np.log([*process.lengths, process.heldout_variance, process.noise])
     assert (np.abs(theta - PRIOR) <= PRIOR_REACH * PRIOR_WIDTH + 1e-9).all()
-    best = _cost(theta, squares_of(x), u, values)[0]
+    best = _cost(theta, [(squares_of(x), u, values)])[0]
     for i in range(6):
         for step in (-0.2, 0.2):
-            assert _cost(theta + step * (np.arange(6) == i), squares_of(x), u, values)[0] > best - 0.05
+            assert _cost(theta + step * (np.arange(6) == i), [(squares_of(x), u, values)])[0] > best - 0.05
 
 
 def test_one_view_and_views_in_one_place():

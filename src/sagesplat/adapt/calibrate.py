@@ -52,18 +52,23 @@ def critical_margins(
 
 
 def critical_nominals(
-    nominal: Float[np.ndarray, " J"], measured: Float[np.ndarray, "n J"], target: float
+    nominal: Float[np.ndarray, " J"],
+    bound: Float[np.ndarray, "n J"],
+    measured: Float[np.ndarray, "n J"],
+    target: float,
 ) -> Float[np.ndarray, " n"]:
     """In each view, the nominal target from which on compositions keep the target.
 
     Args:
         nominal: [J], ascending: the targets that compositions were planned for.
+        bound: [n, J], what is promised of each: a composition is taken for all nominal targets up to that.
         measured: [n, J], quality in the composition.
         target: That is to be kept.
 
     Returns:
-        [n]. Between two compositions it is interpolated by what they measure; the first nominal target where
-        none misses; 1 where the last one does: nothing but the full model is known to keep the target.
+        [n]. Between the bounds of two compositions it is interpolated by what they measure; the first nominal
+        target where none misses; 1 where the last one does: nothing but the full model is known to keep the
+        target.
     """
     n, J = measured.shape
     missed = measured < target
@@ -71,5 +76,6 @@ def critical_nominals(
     rows, after = np.arange(n), np.minimum(last + 1, J - 1)
     low, high = measured[rows, last], measured[rows, after]
     part = np.clip((target - low) / np.maximum(high - low, 1e-12), 0, 1)
-    found = nominal[last] + part * (nominal[after] - nominal[last])
+    found = bound[rows, last] + part * (bound[rows, after] - bound[rows, last])
+    found = np.maximum(found, nominal[last])
     return np.where(missed.any(1), np.where(last == J - 1, 1.0, found), nominal[0])

@@ -50,7 +50,7 @@ class CellModel:
     rows: Int[np.ndarray, " n"]  # views behind the process; none: the offsets are all there is
     log_distances: Float[np.ndarray, " n"]  # log of the cell's distance in them
     median_log_distance: Number  # where it is unknown
-    weights: Float[np.ndarray, "n K"]
+    weights: Float[np.ndarray, "K n"]
     factors: Float[np.ndarray, " V"]  # v_ui of the module's text; -1: the view tells nothing
 
 
@@ -165,7 +165,7 @@ def cell_means(
         seen = np.isfinite(distance) & (distance > 0)
         log = np.where(seen, np.log(np.where(seen, distance, 1.0)), cell.median_log_distance)
         own = np.column_stack([model.views[cell.rows], cell.log_distances])
-        mean = mean + matern32(np.column_stack([known, log]), own, model.lengths) @ cell.weights
+        mean = mean + matern32(np.column_stack([known, log]), own, model.lengths) @ cell.weights.T
     return monotone(mean)
 
 
@@ -240,7 +240,7 @@ def _check(model: FidelityModel) -> None:
     if not (model.cells and len(model.cells[0].offsets) and V and model.photos.size):
         raise ValueError("a model of nothing")
     for cell in model.cells:
-        n, K = cell.weights.shape if len(cell.rows) else (0, len(cell.offsets))
+        K, n = cell.weights.shape
         if (len(cell.rows), len(cell.log_distances)) != (n, n) or len(cell.factors) != V:
             raise ValueError("lists of unequal length")
         if {K, len(cell.offsets)} != {len(model.levels)}:

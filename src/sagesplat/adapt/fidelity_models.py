@@ -143,7 +143,7 @@ def _fit(
         found[:, learnt] = offsets[i][learnt] + process.left_out[i]
         left_out[own, column] = monotone(found)
         cells.append(
-            CellModel(part.ids[i], offsets[i], own, inputs[i][:, 7], medians[i], weights, factors[:, column])
+            CellModel(part.ids[i], offsets[i], own, inputs[i][:, 7], medians[i], weights.T, factors[:, column])
         )
     # the category at equal levels, from its cells without the view
     weight = np.where(np.isnan(left_out[:, part.columns, 0]), 0, shares[:, part.columns])[rows]
@@ -230,7 +230,8 @@ class Trial:
     labels: Sequence[int]  # of the columns, ascending
     shown: Bool[np.ndarray, "V L"]  # whether a viewpoint shows enough of a category to count
     support: Float[np.ndarray, "V L"]  # of the viewpoints; NaN without a model
-    fidelity: Float32[np.ndarray, "V J L"]
+    bound: Float[np.ndarray, "V J L"]  # what is promised of the compositions; NaN: nothing
+    fidelity: Float32[np.ndarray, "V J L"]  # what they measure
 
     def views(self, label: int) -> Int[np.ndarray, " n"]:
         """Rows of the viewpoints that show a category."""
@@ -238,8 +239,9 @@ class Trial:
 
     def critical(self, label: int) -> Float[np.ndarray, "G n"]:
         """For each of TARGETS the critical nominal target in the viewpoints that show the category."""
-        got = self.fidelity[self.views(label)][..., list(self.labels).index(label)]
-        return np.stack([critical_nominals(NOMINAL, got, target) for target in TARGETS])
+        column, rows = list(self.labels).index(label), self.views(label)
+        got, bound = self.fidelity[rows, :, column], np.nan_to_num(self.bound[rows, :, column], nan=1.0)
+        return np.stack([critical_nominals(NOMINAL, bound, got, target) for target in TARGETS])
 
     def missed(self, label: int) -> Int[np.ndarray, " J"]:
         """In how many of these viewpoints each of NOMINAL was missed."""

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Int16, Int32, UInt8
 from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
-from sagesplat.adapt.ladder import Ladder, PrefixLadder
+from sagesplat.adapt.ladder import Ladder, NestedLadder
 from sagesplat.adapt.seen import seen_from
 from sagesplat.adapt.viewpoints import LONGEST
 from sagesplat.core import geometry
@@ -370,12 +370,12 @@ def _each_image(
     `views`: by row the tiles that are wanted at least; None: all.
     """
     how: dict[str, Any] = {"backend": backend, "antialiased": antialiased, "workspace": Workspace()}
-    if isinstance(ladder, PrefixLadder):
-        labels = list(ladder.sizes)
+    if isinstance(ladder, NestedLadder):
+        cells = ladder.cells
 
         def in_view(row: int) -> list[dict[str, float]]:
-            seen = seen_from(ladder, scene.views[row].camera, tile_mask=views[row], **how)
-            images = ((level, seen.render(dict.fromkeys(labels, level))) for level in ladder.levels)
+            seen = seen_from(cells, scene.views[row].camera, tile_mask=views[row], **how)
+            images = ((level, seen.render(dict.fromkeys(cells.sizes, level))) for level in ladder.levels)
             return [found for level, image in images for found in compare(level, row, image)]
 
         yield from (

@@ -14,7 +14,7 @@ from scipy.ndimage import uniform_filter
 
 from sagesplat import __version__
 from sagesplat.adapt.free_poses import level_axes
-from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.ladder import NestedLadder
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.adapt.viewpoints import SETS, in_words
@@ -98,7 +98,7 @@ def report_data(
         categories=_parts(run, names),
         exposed=any(scene.views[row].camera.exposure is not None for row in scene.test_ids),
         photos=has_photos(run),
-        adopted=_adopted(job, ladder) if run.adopted.exists() and isinstance(ladder, PrefixLadder) else (),
+        adopted=_adopted(job, ladder) if run.adopted.exists() and isinstance(ladder, NestedLadder) else (),
         viewpoints=_viewpoints(run),
         noticed=noticed,
         commands=_commands(job),
@@ -121,12 +121,12 @@ def _viewpoints(run: RunDir) -> np.ndarray | None:
         return np.asarray(image.convert("RGB"))
 
 
-def _adopted(job: Job, ladder: PrefixLadder) -> list[tuple[str, str]]:
+def _adopted(job: Job, ladder: NestedLadder) -> list[tuple[str, str]]:
     """How a splat that somebody else trained was looked at, and how its levels were made."""
     made, nest = settings_of(job.run, "adopt"), settings_of(job.run, "nest")
     trained = f"trained on renders of the splat, {nest['steps']:,} steps"
     names = titles(job.names())
-    first = {names[label]: max(levels) for label, levels in ladder.replaces.items() if levels}
+    first = {names[ladder.label_of[cell]]: max(of) for cell, of in ladder.cells.replaces.items() if of}
     originals = ", ".join(f"{titled} {level}" for titled, level in first.items())
     return [
         ("file", Path(made["source"]).name),

@@ -8,7 +8,7 @@ import numpy as np
 from sagesplat.adapt.bound_plans import Costs, plan_for_view, quality_at
 from sagesplat.adapt.calibrate_photos import TARGETS
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.ladder import NestedLadder
 from sagesplat.adapt.observe import Observations, as_unit, erode, measure
 from sagesplat.adapt.photo_models import calibrated, fit_photos, in_composition
 from sagesplat.adapt.seen import seen_from
@@ -87,7 +87,7 @@ def _measure_compositions(
     """
     planned, wanted = part
     ladder = job.ladder
-    assert isinstance(ladder, PrefixLadder)
+    assert isinstance(ladder, NestedLadder)
     masks, workspace = job.level_masks, Workspace()
 
     def in_view(of_view: _Planned) -> list[tuple[int, int, int, list[int], float]]:
@@ -97,12 +97,12 @@ def _measure_compositions(
         if tiles is not None and not tiles.any():
             return rows
         seen = seen_from(
-            ladder, view.camera,
+            ladder.cells, view.camera,
             backend=job.backend, antialiased=job.antialiased, workspace=workspace, tile_mask=tiles,
         )  # fmt: skip
         inner, photo = erode(masks[view]), as_unit(job.photos[row])
         for targets, levels in compositions:
-            found = measure(seen.render(levels), photo, masks[view], inner, job.valid[view], tiles)
+            found = measure(seen.render(ladder.of_cells(levels)), photo, masks[view], inner, job.valid[view], tiles)
             rows += [
                 (label, levels.get(label, -1), row, targets, values["ssim"])
                 for label, values in found.items()
