@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tyro
@@ -16,78 +16,61 @@ from benchmarks.runtime.walk import recorded
 from sagesplat.formats.ply import put_ply
 from sagesplat.run.job import Job
 
-BUDGETS = (
-    0.005,
-    0.01,
-    0.015,
-    0.025,
-    0.04,
-    0.06,
-    0.1,
-    0.15,
-    0.25,
-    0.4,
-    0.6,
-    1.0,
-)  # of the full model's splats
+# of the full model's splats
+BUDGETS = (0.005, 0.01, 0.015, 0.025, 0.04, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 FOLDER = Path(tempfile.gettempdir()) / "sagesplat-runtime"
-CELLS = 50  # that a level of PlayCanvas is cut into at least, in the row of small chunks
+
+
+class Tools(NamedTuple):
+    """What makes the others' levels; None: their rows are left out."""
+
+    splat_transform: Path | None
+    spark: Path | None
+    chunks: tuple[int, ...]  # of PlayCanvas: see `playcanvas.made`
 
 
 def measure(
-    run: Path, folder: Path, tool: Path | None, package: Path | None, without: Path | None, decimate: str,
-    seed: int, screen: float, every: int,
-) -> dict[str, Any]:  # fmt: skip
+    run: Path, without: Path | None, folder: Path, tools: Tools, seed: int, screen: float, every: int
+) -> dict[str, Any]:
     """One scene's tables."""
     job, folder = opened(run), folder / run.name
     folder.mkdir(parents=True, exist_ok=True)
-    cameras = recorded(job, folder / "walk.json", seed, screen, every)
-    references = job.references
-    methods: list[Method] = [
-        equal_levels(job, references, len(cameras)),
-        planned("ours", job, references, cameras),
-    ]
+    cameras, references = recorded(job, folder / "walk.json", seed, screen, every), job.references
+    equal = equal_levels(job, references, len(cameras))
+    methods: list[Method] = [equal, planned("ours", job, references, cameras)]
     if without:
         other = opened(without)
         methods.append(planned("ours without cells", other, other.references, cameras))
-    methods += rivals(job, folder, tool, package, decimate)
-    for method in methods:
-        print(f"{method.name}: {len(method.piece_bytes)} files or ranges, {sum(method.piece_bytes):,} bytes")
-    found = walk(methods, references, cameras)
-    size = int(sum(methods[0].piece_bytes))
+    methods += rivals(job, folder, tools)
     print(f"{run.name}: {len(cameras)} frames at {cameras[0].width} x {cameras[0].height}")
-    result = summary(found, job.ladder.size(job.ladder.levels[-1]), size)
-    for line in lines(result):
-        print(line)
+    for method in methods:
+        print(f"  {method.name}: {len(method.piece_bytes)} pieces, {sum(method.piece_bytes) / 1e6:.2f} MB")
+    found = walk(methods, references, cameras)
+    result = summary(found, job.ladder.size(job.ladder.levels[-1]), int(sum(equal.piece_bytes)))
+    print("\n".join(lines(result)))
     return result
 
 
-def rivals(job: Job, folder: Path, tool: Path | None, package: Path | None, decimate: str) -> list[Method]:
+def rivals(job: Job, folder: Path, tools: Tools) -> list[Method]:
     """Methods of others; what their tools made of the full model is kept in the folder."""
     full = job.came_in or job.ladder.load(job.ladder.levels[-1])
-    model = folder / "full.ply"
+    model, methods = folder / "full.ply", list[Method]()
     put_ply(model, full, antialiased=job.antialiased)
     budgets = [share * len(full) for share in BUDGETS]
-    methods: list[Method] = []
-    if tool is None or not tool.exists():
+    if tools.splat_transform is None or not tools.splat_transform.exists():
         print("no rows of PlayCanvas: --splat-transform names no file of splat-transform")
     else:
         extent = float(np.ptp(np.quantile(full.means.numpy(), [0.05, 0.95], axis=0), axis=0).max())
-        small = ["--lod-chunk-count", f"{max(len(full) // CELLS // 1000, 1)}", "--lod-chunk-min", "1"]
-        for name, options in (
-            ("PlayCanvas", []),
-            ("PlayCanvas, small chunks", [*small, "--lod-chunk-extent", f"{extent / 4:.4g}"]),
-        ):
-            place = folder / f"{name.replace(', ', '-').replace(' ', '-').lower()}-{decimate}"
-            meta = playcanvas.made(place, model, tool, decimate, options)
-            method = playcanvas.StreamedSog(name, meta, budgets, job.backend, job.antialiased)
-            methods.append(method)
-    if package is None or not package.exists():
+        for chunk in tools.chunks:
+            meta = playcanvas.made(model, tools.splat_transform, chunk, extent)
+            name = f"PlayCanvas, chunks of {chunk}K" if chunk else "PlayCanvas"
+            methods.append(playcanvas.StreamedSog(name, meta, budgets, job.backend, job.antialiased))
+    if tools.spark is None or not tools.spark.exists():
         print("no rows of Spark: --spark names no folder of @sparkjsdev/spark")
     else:
         kept = folder / "spark.npz"
         if not kept.exists():
-            np.savez(kept, **spark_tree.built(model, package))
+            np.savez(kept, allow_pickle=False, **spark_tree.built(model, tools.spark))
         with np.load(kept) as arrays:
             tree = spark.decoded(dict(arrays), full)
         for name, foveation in (("Spark", spark.NO_FOVEATION), ("Spark, foveation", spark.FOVEATION)):
@@ -101,7 +84,7 @@ def main(
     splat_transform: Path | None = None,
     spark: Path | None = None,
     without_cells: tuple[Path, ...] = (),
-    decimate: str = "decimate",
+    chunks: tuple[int, ...] = (0, 3),
     seed: int = 5,
     screen: float = 1.0,
     every: int = 2,
@@ -115,15 +98,16 @@ def main(
         splat_transform: PlayCanvas's command line, 3.7 (bin/cli.mjs); without it, no rows of PlayCanvas.
         spark: folder of @sparkjsdev/spark 2.2, with three beside it; without it, no rows of Spark.
         without_cells: the same scenes run with --nest.cells 0, in the order of `runs`.
-        decimate: splat-transform's way to make levels, decimate or decimate-adaptive.
+        chunks: thousands of splats in a file of PlayCanvas, a row each; 0: as its tool has it, 512.
         seed: of the walk.
         screen: pixels, times the side of the photos.
         every: of how many frames (two a second) one is measured.
         write: keep the figures in benchmarks/results/cpu/runtime.json.
     """
+    tools = Tools(splat_transform, spark, chunks)
     others: Sequence[Path | None] = without_cells or [None] * len(runs)
     results = {
-        run.name: measure(run, folder, splat_transform, spark, other, decimate, seed, screen, every)
+        run.name: measure(run, other, folder, tools, seed, screen, every)
         for run, other in zip(runs, others, strict=True)
     }
     finish("runtime", results, write)

@@ -24,6 +24,11 @@ def opened(run: Path) -> Job:
     return Job(RunDir(run, "nested"), lambda event: None)
 
 
+def ladder_ids(job: Job) -> list[int]:
+    """What the ladder has levels of, ascending: the columns of all levels here."""
+    return sorted({label for label, _ in job.ladder.counts})
+
+
 def ours(job: Job, references: References, cameras: Sequence[Camera], targets: Sequence[float]) -> np.ndarray:
     """The planner's levels, int [V, J, L] from 1 to K: by camera, target and the ladder's ids, ascending."""
     costs = NestedLevels(job).costs
@@ -47,7 +52,7 @@ class Levels:
         self, name: str, job: Job, references: References, settings: Sequence[float], levels: np.ndarray
     ):
         self.name, self.settings, self._job, self._levels = name, settings, job, levels
-        self._references, self._ids = references, sorted(job.ladder.sizes)  # type: ignore[attr-defined]
+        self._references, self._ids = references, ladder_ids(job)
         listed = increments_of(job)
         self.piece_bytes = np.array([one.nbytes for one in listed])
         self.index_bytes = index_bytes(job.run)
@@ -67,13 +72,14 @@ class Levels:
             needed = np.zeros(len(self.piece_bytes), bool)
             for of_level in levels.items():
                 needed[self._pieces[of_level]] = True
-            yield Shown(seen.render(levels), sum(map(self._job.ladder.counts.get, levels.items())), needed)  # type: ignore[arg-type]
+            count = sum(self._job.ladder.counts[of_level] for of_level in levels.items())
+            yield Shown(seen.render(levels), count, needed)
 
 
 def equal_levels(job: Job, references: References, frames: int) -> Levels:
     """All categories at one level."""
-    K, ids = len(job.ladder.levels), len(job.ladder.sizes)  # type: ignore[attr-defined]
-    levels = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (frames, K, ids))
+    K = len(job.ladder.levels)
+    levels = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (frames, K, len(ladder_ids(job))))
     return Levels("equal levels", job, references, tuple(range(1, K + 1)), levels)
 
 

@@ -50,13 +50,18 @@ class Walked:
     nbytes: np.ndarray  # [F, J], fetched up to this frame
 
     def curve(self, over: str) -> tuple[np.ndarray, np.ndarray]:
-        """Splats (mean) or bytes (by the end) [J], ascending, and fidelity: mean, 5th percentile, lowest."""
-        x = self.count.mean(0) if over == "count" else self.nbytes[-1].astype(np.float64)
-        y = np.stack([self.whole.mean(0), np.quantile(self.whole, 0.05, axis=0), self.lowest.mean(0)])
-        x, rows = np.unique(x, return_index=True)
-        return x, y[:, rows]
+        """Splats (mean) or bytes (by the end), ascending, and fidelity: mean, 5th percentile, lowest [3, n].
 
-    def at(self, over: str, at: Sequence[float]) -> np.ndarray:
+        Only of settings that no other one is better than, in the mean, with less.
+        """
+        x = self.count.mean(0) if over == "count" else self.nbytes[-1]
+        y = np.stack([self.whole.mean(0), np.quantile(self.whole, 0.05, axis=0), self.lowest.mean(0)])
+        order = np.lexsort([-y[0], x])
+        best = np.maximum.accumulate(y[0, order])
+        rows = order[np.concatenate([[True], best[1:] > best[:-1]])]
+        return x[rows].astype(np.float64), y[:, rows]
+
+    def at(self, over: str, at: np.ndarray) -> np.ndarray:
         """Those three [3, len(at)] at so many splats or bytes, along their logarithm.
 
         NaN where a method cannot do with so little; what it reaches with all where there is more than that.

@@ -38,24 +38,33 @@ from sagesplat.scene.scene import Camera
 BEHIND, SHRINK, MULTIPLIER = 1.5, 0.75, 3.0  # lodBehindPenalty, lodDistanceShrink, lodMultiplier
 _BINS = 96 / 1024 / 1024  # of the logarithm of distances, that are taken together
 _HALVINGS = 6  # "halving the Gaussian count at each level", as SuperSplat publishes scenes
+_ITERATIONS = "1"  # of k-means for harmonics: ten, the default, take hours without a GPU
 
 
-def made(folder: Path, model: Path, tool: Path, decimate: str, options: Sequence[str]) -> Path:
-    """The lod-meta.json of a PLY, made by splat-transform where it is not there yet."""
-    meta = folder / "lod-meta.json"
+def made(model: Path, tool: Path, chunk: int, extent: float) -> Path:
+    """The lod-meta.json of a PLY, made by splat-transform where it is not there yet.
+
+    `chunk`: thousands of splats in a file, and in eighths of the `extent` a node's side, whatever it holds;
+    0: as the tool has it by itself.
+    """
+    meta = model.with_name(f"playcanvas-{chunk}") / "lod-meta.json"
     if meta.exists():
         return meta
     node = [shutil.which("node") or "node"] if tool.suffix in (".mjs", ".js") else []
-    command = [*node, str(tool), "-q", "-w", "-g", "cpu"]
+    command = [*node, str(tool), "-q", "-w", "-g", "cpu", "-i", _ITERATIONS]
     levels = [model]
     for k in range(1, _HALVINGS + 1):
-        levels.append(model.with_name(f"{decimate}-{k}.ply"))
+        levels.append(model.with_name(f"decimated-{k}.ply"))
         if not levels[-1].exists():
-            share = f"{100 / 2**k:g}%"
-            subprocess.run([*command, str(model), f"--{decimate}", share, str(levels[-1])], check=True)
+            subprocess.run(
+                [*command, str(model), "--decimate", f"{100 / 2**k:g}%", str(levels[-1])], check=True
+            )
+    if chunk:
+        command += ["--lod-chunk-count", f"{chunk}", "--lod-chunk-extent", f"{extent / 8:.4g}"]
+        command += ["--lod-chunk-min", "1"]
     inputs = [part for k, path in enumerate(levels) for part in (str(path), "-l", str(k))]
-    folder.mkdir(parents=True, exist_ok=True)
-    subprocess.run([*command, *options, *inputs, str(meta)], check=True)
+    meta.parent.mkdir(exist_ok=True)
+    subprocess.run([*command, *inputs, str(meta)], check=True)
     return meta
 
 

@@ -137,7 +137,7 @@ def page_bytes(tree: Tree) -> np.ndarray:
         stored.astype(np.float16)[None],
         np.diff(_steps(colour, *_within(colour, 0.0, 1.0), 255).T, axis=1, prepend=np.uint8(0)),
         _steps(scales, *_within(np.sort(scales, 1)[:, 1:], -12.0, 9.0), 254).T + np.uint8(1),
-        _turns(g.quats.numpy()).T,
+        _turns(g.quats.numpy()),
     ]
     begin = 0
     for bases in (3, 5, 7):
@@ -147,12 +147,12 @@ def page_bytes(tree: Tree) -> np.ndarray:
             columns.append(np.clip(np.round(part / most * 127), -127, 127).astype(np.int8).T)
         begin += bases
     columns += [tree.children.astype(np.uint16)[None], tree.first.astype(np.uint32)[None]]
-    # one dimension of a property after the other; but the bytes of a rotation together
-    return np.array([
-        _PAGE_HEAD
-        + sum(_deflated(one[:, at : at + PAGE].tobytes("F" if i == 4 else "C")) for i, one in enumerate(columns))
+    # one dimension after the other, but the three bytes of a rotation together: they are rows
+    pages = [
+        [(one[at : at + PAGE] if len(one) == n else one[:, at : at + PAGE]).tobytes() for one in columns]
         for at in range(0, n, PAGE)
-    ])  # fmt: skip
+    ]
+    return np.array([_PAGE_HEAD + sum(map(_deflated, page)) for page in pages])
 
 
 def _within(values: np.ndarray, low: float, high: float) -> tuple[float, float]:
@@ -209,7 +209,7 @@ def traverse(centre, size, first, children, at, forward, cones, budget, limit):
                 chosen[n] = child
                 n += 1
             else:
-                heapq.heappush(frontier, (-look, child))
+                heapq.heappush(frontier, (-look, np.int64(child)))
         count += children[node] - 1
     for _, node in frontier:
         chosen[n] = node

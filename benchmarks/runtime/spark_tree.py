@@ -4,6 +4,7 @@ import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +19,7 @@ _BUILD = """async () => {
   const splats = new ExtSplats({ fileBytes, fileType: "ply", lod: "quality" })
   await splats.initialized
   const tree = splats.lodSplats
-  const arrays = { ext0: tree.extArrays[0], ext1: tree.extArrays[1] }
-  for (const name of ["sh1", "sh2", "sh3a", "sh3b", "lodTree"])
-    if (tree.extra[name]) arrays[name] = tree.extra[name]
+  const arrays = { ext0: tree.extArrays[0], ext1: tree.extArrays[1], lodTree: tree.extra.lodTree }
   for (const [name, array] of Object.entries(arrays)) {
     const words = array.subarray(0, 4 * tree.numSplats)
     await fetch("/put/" + name, { method: "POST", body: words.slice() })
@@ -32,9 +31,9 @@ _BUILD = """async () => {
 class _Handler(SimpleHTTPRequestHandler):
     """Serves the page, the packages and the model, and takes the arrays of the tree."""
 
-    def __init__(self, *args: object, places: dict[str, Path], taken: dict[str, bytes]):
+    def __init__(self, *args: Any, places: dict[str, Path], taken: dict[str, bytes]):
         self.places, self.taken = places, taken
-        super().__init__(*args)  # type: ignore[arg-type]
+        super().__init__(*args)
 
     def do_GET(self) -> None:
         """A file of a place, or the page."""
@@ -78,6 +77,6 @@ def built(model: Path, package: Path) -> dict[str, np.ndarray]:
             server.shutdown()
             thread.join()
     arrays = {name: np.frombuffer(content, np.uint32).reshape(-1, 4) for name, content in taken.items()}
-    if any(len(array) != count for array in arrays.values()) or "lodTree" not in arrays:
+    if len(arrays) != 3 or any(len(array) != count for array in arrays.values()):
         raise SystemExit(f"Spark's tree of {count} splats came in parts of other lengths")
     return arrays
