@@ -44,8 +44,7 @@ _ITERATIONS = "1"  # of k-means for harmonics: ten, the default, take hours with
 def made(model: Path, tool: Path, chunk: int, extent: float) -> Path:
     """The lod-meta.json of a PLY, made by splat-transform where it is not there yet.
 
-    `chunk`: thousands of splats in a file, and in eighths of the `extent` a node's side, whatever it holds;
-    0: as the tool has it by itself.
+    `chunk`: thousands of splats in a file, an eighth of `extent` wide at most; 0: as the tool has it.
     """
     meta = model.with_name(f"playcanvas-{chunk}") / "lod-meta.json"
     if meta.exists():
@@ -60,7 +59,7 @@ def made(model: Path, tool: Path, chunk: int, extent: float) -> Path:
                 [*command, str(model), "--decimate", f"{100 / 2**k:g}%", str(levels[-1])], check=True
             )
     if chunk:
-        command += ["--lod-chunk-count", f"{chunk}", "--lod-chunk-extent", f"{extent / 8:.4g}"]
+        command += ["--lod-chunk-count", f"{chunk}", "--lod-chunk-extent", f"{max(round(extent / 8), 1)}"]
         command += ["--lod-chunk-min", "1"]
     inputs = [part for k, path in enumerate(levels) for part in (str(path), "-l", str(k))]
     meta.parent.mkdir(exist_ok=True)

@@ -40,7 +40,7 @@ from sagesplat.scene.scene import Camera
 PAGE = 65536
 FOVEATION = (90.0, 120.0, 0.4, 0.2)  # coneFov0, coneFov (degrees), coneFoveate, behindFoveate
 NO_FOVEATION = (180.0, 180.0, 1.0, 1.0)
-_COPIES = 16  # that an opacity above 1 is drawn as, at most: beyond that they are wider
+_COPIES = 12  # that an opacity above 1 is drawn as, at most: beyond that they are wider
 _OPAQUE = 1 - 1e-6
 _PAGE_HEAD, _FILE_HEAD = 1500, 700  # bytes of JSON, about
 
@@ -187,11 +187,11 @@ def traverse(centre, size, first, children, at, forward, cones, budget, limit):
     chosen, n = np.empty(len(size), np.int64), 0
     pages = np.zeros((len(size) + PAGE - 1) // PAGE, np.bool_)
     pages[0] = True
-    frontier = [(-_look(centre, size, 0, at, forward, cones), np.int64(0))]
+    frontier = [(-look_of(centre, size, 0, at, forward, cones), np.int64(0))]
     count = 1
     while frontier:
-        look, node = frontier[0]
-        if -look <= limit:
+        large, node = frontier[0]
+        if -large <= limit:
             break
         if children[node] == 0:
             heapq.heappop(frontier)
@@ -204,12 +204,12 @@ def traverse(centre, size, first, children, at, forward, cones, budget, limit):
         begin, end = first[node], first[node] + children[node]
         pages[begin // PAGE] = pages[(end - 1) // PAGE] = True
         for child in range(begin, end):
-            look = _look(centre, size, child, at, forward, cones)
-            if look <= limit:
+            large = look_of(centre, size, child, at, forward, cones)
+            if large <= limit:
                 chosen[n] = child
                 n += 1
             else:
-                heapq.heappush(frontier, (-look, np.int64(child)))
+                heapq.heappush(frontier, (-large, np.int64(child)))
         count += children[node] - 1
     for _, node in frontier:
         chosen[n] = node
@@ -218,7 +218,7 @@ def traverse(centre, size, first, children, at, forward, cones, budget, limit):
 
 
 @njit(cache=True)
-def _look(centre, size, node, at, forward, cones):
+def look_of(centre, size, node, at, forward, cones):
     """How large a splat looks."""
     d = centre[node] - at
     distance = max(math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 1e-6)
@@ -238,8 +238,8 @@ def _look(centre, size, node, at, forward, cones):
 def wide(g: Gaussians, opacity: np.ndarray, camera: Camera, antialiased: bool) -> Gaussians:
     """Plain Gaussians that look as the splats do, to be drawn without the antialiasing filter.
 
-    (1 - G)^A is drawn as copies of an opaque G, and one of the rest of A; from 16 on, A of a wider G, that
-    lets half of the light through at the same distance.
+    (1 - G)^A is drawn as copies of an opaque G, and one of the rest of A; beyond 12 copies they are wider, so
+    that half of the light passes at the same distance. Within 0.04 of it up to A = 17.
     """
     if antialiased:
         opaque = replace(g, logit_opacities=torch.full_like(g.logit_opacities, 20.0))
