@@ -1,6 +1,6 @@
 """Frames of a walk against the full model, and curves of that over splats drawn and bytes fetched."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -75,15 +75,9 @@ class Walked:
         return float(enough.min(initial=np.inf))
 
 
-def walk(
-    methods: Sequence[Method],
-    references: References,
-    cameras: Sequence[Camera],
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Walked]:
+def walk(methods: Sequence[Method], references: References, cameras: Sequence[Camera]) -> list[Walked]:
     """Measure every frame of every method at every setting."""
-    F = len(cameras)
-    tables = [np.zeros((4, F, len(method.settings))) for method in methods]
+    tables = [np.zeros((4, len(cameras), len(method.settings))) for method in methods]
     fetched = [np.zeros((len(method.settings), len(method.piece_bytes)), bool) for method in methods]
     for frame, camera in enumerate(cameras):
         at = references.at(camera)
@@ -92,8 +86,6 @@ def walk(
                 have[j] |= shown.needed
                 sent = method.index_bytes + int(method.piece_bytes[have[j]].sum())
                 table[:, frame, j] = *fidelity(shown.image, at.image, at.label_ids), shown.count, sent
-        if progress:
-            progress(frame + 1, F)
     return [
         Walked(method.name, tuple(method.settings), *table)
         for method, table in zip(methods, tables, strict=True)
@@ -150,9 +142,8 @@ def lines(result: dict[str, Any]) -> list[str]:
             cells = ["–" if np.isnan(three[0]) else " ".join(f"{v:.3f}" for v in three) for three in row[key]]
             out.append(f"| {name} | " + " | ".join(cells) + " |")
         out.append("")
-    out.append(
-        "| method | first view at 0.9, MB | " + " | ".join(f"s at {r} Mbit/s" for r in RATES) + " | finest |"
-    )
+    rates = " | ".join(f"s at {rate} Mbit/s" for rate in RATES)
+    out.append(f"| method | first view at {FIDELITY:g}, MB | {rates} | finest |")
     out.append("|---" * (len(RATES) + 3) + "|")
     for name, row in methods.items():
         seconds = " | ".join(f"{s:.2f}" for s in row["first_s"])
