@@ -201,6 +201,24 @@ def test_a_run_is_measured_on_the_same_walk_each_time(finished_run, tmp_path, ca
     assert (np.diff(levels.sum(2), axis=1) >= 0).all()
 
 
+def test_levels_of_playcanvas_are_made_once(tmp_path):
+    tool = tmp_path / "tool"
+    touch = "for word; do case $word in *.ply|*.json) touch $word;; esac; done"
+    tool.write_text(f'#!/bin/sh\necho "$@" >> "$0.log"\n{touch}\n')
+    tool.chmod(0o755)
+    model = tmp_path / "full.ply"
+    model.touch()
+    meta = playcanvas.made(model, tool, 3, 40.0, 0)
+    assert meta == playcanvas.made(model, tool, 3, 40.0, 0)
+    *halved, bundled = (tmp_path / "tool.log").read_text().splitlines()
+    assert [line.split("--decimate ")[1].split()[0] for line in halved] == [
+        "50%", "25%", "12.5%", "6.25%", "3.125%", "1.5625%"
+    ]  # fmt: skip
+    assert f"{model} -l 0 {tmp_path}/decimated-1.ply -l 1 {tmp_path}/decimated-2.ply -l 2" in bundled
+    assert "--lod-chunk-count 3 --lod-chunk-extent 5" in bundled
+    assert bundled.endswith(f"decimated-6.ply -l 6 {meta} --filter-harmonics 0")
+
+
 def test_streamed_sog_of_playcanvas_is_drawn_by_its_budget(finished_run, tmp_path):
     job = opened(finished_run)
     levels = [job.ladder.load(level) for level in (job.ladder.levels[-1], job.ladder.levels[0])]

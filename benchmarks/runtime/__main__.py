@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -27,6 +27,7 @@ class Tools(NamedTuple):
     splat_transform: Path | None
     spark: Path | None
     chunks: tuple[int, ...]  # of PlayCanvas: see `playcanvas.made`
+    harmonics: int
 
 
 def measure(
@@ -36,8 +37,10 @@ def measure(
     job, folder = opened(run), folder / run.name
     folder.mkdir(parents=True, exist_ok=True)
     cameras, references = recorded(job, folder / "walk.json", seed, screen, every), job.references
-    equal = equal_levels(job, references, len(cameras))
-    methods: list[Method] = [equal, planned("ours", job, references, cameras)]
+    methods: list[Method] = [
+        equal_levels(job, references, len(cameras)),
+        planned("ours", job, references, cameras),
+    ]
     if without:
         other = opened(without)
         methods.append(planned("ours without cells", other, other.references, cameras))
@@ -46,7 +49,7 @@ def measure(
     for method in methods:
         print(f"  {method.name}: {len(method.piece_bytes)} pieces, {sum(method.piece_bytes) / 1e6:.2f} MB")
     found = walk(methods, references, cameras)
-    result = summary(found, job.ladder.size(job.ladder.levels[-1]), int(sum(equal.piece_bytes)))
+    result = summary(found, job.ladder.size(job.ladder.levels[-1]), int(found[0].nbytes[0, -1]))
     print("\n".join(lines(result)))
     return result
 
@@ -62,7 +65,7 @@ def rivals(job: Job, folder: Path, tools: Tools) -> list[Method]:
     else:
         extent = float(np.ptp(np.quantile(full.means.numpy(), [0.05, 0.95], axis=0), axis=0).max())
         for chunk in tools.chunks:
-            meta = playcanvas.made(model, tools.splat_transform, chunk, extent)
+            meta = playcanvas.made(model, tools.splat_transform, chunk, extent, tools.harmonics)
             name = f"PlayCanvas, chunks of {chunk}K" if chunk else "PlayCanvas"
             methods.append(playcanvas.StreamedSog(name, meta, budgets, job.backend, job.antialiased))
     if tools.spark is None or not tools.spark.exists():
@@ -85,6 +88,7 @@ def main(
     spark: Path | None = None,
     without_cells: tuple[Path, ...] = (),
     chunks: tuple[int, ...] = (0, 3),
+    harmonics: Literal[0, 1, 2, 3] = 3,
     seed: int = 5,
     screen: float = 1.0,
     every: int = 2,
@@ -99,12 +103,13 @@ def main(
         spark: folder of @sparkjsdev/spark 2.2, with three beside it; without it, no rows of Spark.
         without_cells: the same scenes run with --nest.cells 0, in the order of `runs`.
         chunks: thousands of splats in a file of PlayCanvas, a row each; 0: as its tool has it, 512.
+        harmonics: degree that PlayCanvas's files keep; with any, large chunks take hours without a GPU.
         seed: of the walk.
         screen: pixels, times the side of the photos.
         every: of how many frames (two a second) one is measured.
         write: keep the figures in benchmarks/results/cpu/runtime.json.
     """
-    tools = Tools(splat_transform, spark, chunks)
+    tools = Tools(splat_transform, spark, chunks, harmonics)
     others: Sequence[Path | None] = without_cells or [None] * len(runs)
     results = {
         run.name: measure(run, other, folder, tools, seed, screen, every)

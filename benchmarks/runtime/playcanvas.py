@@ -41,12 +41,13 @@ _HALVINGS = 6  # "halving the Gaussian count at each level", as SuperSplat publi
 _ITERATIONS = "1"  # of k-means for harmonics: ten, the default, take hours without a GPU
 
 
-def made(model: Path, tool: Path, chunk: int, extent: float) -> Path:
+def made(model: Path, tool: Path, chunk: int, extent: float, harmonics: int) -> Path:
     """The lod-meta.json of a PLY, made by splat-transform where it is not there yet.
 
     `chunk`: thousands of splats in a file, an eighth of `extent` wide at most; 0: as the tool has it.
+    `harmonics`: the degree that is kept.
     """
-    meta = model.with_name(f"playcanvas-{chunk}") / "lod-meta.json"
+    meta = model.with_name(f"playcanvas-{chunk}-{harmonics}") / "lod-meta.json"
     if meta.exists():
         return meta
     node = [shutil.which("node") or "node"] if tool.suffix in (".mjs", ".js") else []
@@ -63,7 +64,7 @@ def made(model: Path, tool: Path, chunk: int, extent: float) -> Path:
         command += ["--lod-chunk-min", "1"]
     inputs = [part for k, path in enumerate(levels) for part in (str(path), "-l", str(k))]
     meta.parent.mkdir(exist_ok=True)
-    subprocess.run([*command, *inputs, str(meta)], check=True)
+    subprocess.run([*command, *inputs, str(meta), "--filter-harmonics", str(harmonics)], check=True)
     return meta
 
 
