@@ -1,0 +1,151 @@
+"""Frames of a walk against the full model, and curves of that over splats drawn and bytes fetched."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from sagesplat.adapt.fidelity import PROMISED_SHARE, References
+from sagesplat.metrics.image import means_by_label, ssim_map
+from sagesplat.scene.scene import Camera
+from sagesplat.segment.masks import UNLABELLED
+
+COUNTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4)  # of the full model's splats, at which methods meet
+SIZES = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)  # of our bytes of the full model: others take several times as many
+RATES = (2, 10, 50)  # Mbit/s
+FIDELITY = 0.9  # that a first view waits for
+
+
+class Shown(NamedTuple):
+    """What a method draws in a frame at one setting of its knob."""
+
+    image: np.ndarray  # float32 [H, W, 3] in [0, 1]; may be overwritten by the next one
+    count: int  # splats that are selected, in sight or not: what a viewer's budget counts
+    needed: np.ndarray  # bool [P], pieces of its files that have to be there
+
+
+class Method(Protocol):
+    """One way to choose what is drawn."""
+
+    name: str
+    settings: Sequence[float]  # J, of its knob
+    piece_bytes: np.ndarray  # int64 [P], of what is fetched as one, encoded
+    index_bytes: int  # that come before anything else
+
+    def shown(self, frame: int, camera: Camera) -> Iterator[Shown]:
+        """What is drawn at each setting."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Walked:
+    """A method's walk: F frames at J settings."""
+
+    name: str
+    settings: tuple[float, ...]
+    whole: np.ndarray  # [F, J], SSIM against the full model, of the whole image
+    lowest: np.ndarray  # [F, J], of the lowest category of at least PROMISED_SHARE of the pixels
+    count: np.ndarray  # [F, J], splats
+    nbytes: np.ndarray  # [F, J], fetched up to this frame
+
+    def curve(self, over: str) -> tuple[np.ndarray, np.ndarray]:
+        """Splats (mean) or bytes (by the end), ascending, and fidelity: mean, 5th percentile, lowest [3, n].
+
+        Only of settings that no other one is better than, in the mean, with less.
+        """
+        x = self.count.mean(0) if over == "count" else self.nbytes[-1]
+        y = np.stack([self.whole.mean(0), np.quantile(self.whole, 0.05, axis=0), self.lowest.mean(0)])
+        order = np.lexsort([-y[0], x])
+        best = np.maximum.accumulate(y[0, order])
+        rows = order[np.concatenate([[True], best[1:] > best[:-1]])]
+        return x[rows].astype(np.float64), y[:, rows]
+
+    def at(self, over: str, at: np.ndarray) -> np.ndarray:
+        """Those three [3, len(at)] at so many splats or bytes, along their logarithm.
+
+        NaN where a method cannot do with so little; what it reaches with all where there is more than that.
+        """
+        x, y = self.curve(over)
+        return np.stack([np.interp(np.log(at), np.log(x), row, left=np.nan) for row in y])
+
+    def first_bytes(self) -> float:
+        """Fewest bytes with which the first view reaches FIDELITY; inf: it never does."""
+        enough = self.nbytes[0][self.whole[0] >= FIDELITY]
+        return float(enough.min(initial=np.inf))
+
+
+def walk(methods: Sequence[Method], references: References, cameras: Sequence[Camera]) -> list[Walked]:
+    """Measure every frame of every method at every setting."""
+    tables = [np.zeros((4, len(cameras), len(method.settings))) for method in methods]
+    fetched = [np.zeros((len(method.settings), len(method.piece_bytes)), bool) for method in methods]
+    for frame, camera in enumerate(cameras):
+        at = references.at(camera)
+        for method, table, have in zip(methods, tables, fetched, strict=True):
+            for j, shown in enumerate(method.shown(frame, camera)):
+                have[j] |= shown.needed
+                sent = method.index_bytes + int(method.piece_bytes[have[j]].sum())
+                table[:, frame, j] = *fidelity(shown.image, at.image, at.label_ids), shown.count, sent
+    return [
+        Walked(method.name, tuple(method.settings), *table)
+        for method, table in zip(methods, tables, strict=True)
+    ]
+
+
+def fidelity(image: np.ndarray, full: np.ndarray, label_ids: np.ndarray) -> tuple[float, float]:
+    """SSIM of the whole image, and of the lowest category that covers enough of it."""
+    quality = ssim_map(image, full)
+    means = means_by_label(quality, label_ids)
+    least = PROMISED_SHARE * label_ids.size
+    of_category = [mean for label, (mean, n) in means.items() if n >= least and label != UNLABELLED]
+    whole = float(quality.mean())
+    return whole, min(of_category, default=whole)
+
+
+def summary(found: Sequence[Walked], count: int, nbytes: int) -> dict[str, Any]:
+    """Every method at shares of `count` splats and of `nbytes`, and its first view."""
+    counts, sizes = np.array(COUNTS) * count, np.array(SIZES) * nbytes
+    return {
+        "counts": counts.tolist(),
+        "bytes": sizes.tolist(),
+        "methods": {
+            one.name: {
+                "at_counts": one.at("count", counts).T.tolist(),
+                "at_bytes": one.at("bytes", sizes).T.tolist(),
+                "first_mb": one.first_bytes() / 1e6,
+                "first_s": [8e-6 * one.first_bytes() / rate for rate in RATES],
+                "finest": float(one.whole.mean(0).max()),
+                "curve": {
+                    "settings": list(one.settings),
+                    "count": one.count.mean(0).tolist(),
+                    "bytes": one.nbytes[-1].tolist(),
+                    "mean": one.whole.mean(0).tolist(),
+                    "p5": np.quantile(one.whole, 0.05, axis=0).tolist(),
+                    "lowest": one.lowest.mean(0).tolist(),
+                },
+            }
+            for one in found
+        },
+    }
+
+
+def lines(result: dict[str, Any]) -> list[str]:
+    """Tables for people: mean, 5th percentile and lowest category at equal splats, and at equal bytes."""
+    out, methods = [], result["methods"]
+    for key, head in (
+        ("at_counts", [f"{n:,.0f} splats" for n in result["counts"]]),
+        ("at_bytes", [f"{n / 1e6:.2f} MB" for n in result["bytes"]]),
+    ):
+        out.append("| method | " + " | ".join(head) + " |")
+        out.append("|---" * (len(head) + 1) + "|")
+        for name, row in methods.items():
+            cells = ["–" if np.isnan(three[0]) else " ".join(f"{v:.3f}" for v in three) for three in row[key]]
+            out.append(f"| {name} | " + " | ".join(cells) + " |")
+        out.append("")
+    rates = " | ".join(f"s at {rate} Mbit/s" for rate in RATES)
+    out.append(f"| method | first view at {FIDELITY:g}, MB | {rates} | finest |")
+    out.append("|---" * (len(RATES) + 3) + "|")
+    for name, row in methods.items():
+        seconds = " | ".join(f"{s:.2f}" for s in row["first_s"])
+        out.append(f"| {name} | {row['first_mb']:.3f} | {seconds} | {row['finest']:.4f} |")
+    return out
