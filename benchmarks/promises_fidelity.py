@@ -215,7 +215,8 @@ def lines(name: str, result: dict[str, Any]) -> list[str]:
             worst = _worst(row, result["categories"])
             out.append(
                 f"  {target:>5}: kept {row['kept']:.3f} [{low:.3f}, {high:.3f}] of {row['decisions']}, "
-                f"excess {row['excess']:.4f} (perfect {row['perfect']:.4f}); worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
+                f"excess {row['excess']:.4f} (perfect {row['perfect']:.4f}); "
+                f"worst {worst[0]} {worst[1][0]} of {worst[1][1]}"
             )
     for target, row in result["scene_plans"].items():
         worst = _worst(row, result["categories"])

@@ -39,16 +39,17 @@ def measure(
     cameras, references = recorded(job, folder / "walk.json", seed, screen, every), job.references
     methods: list[Method] = [
         equal_levels(job, references, len(cameras)),
-        planned("ours", job, references, cameras),
+        planned("ours", job, references, cameras, BUDGETS),
     ]
-    if without:
-        other = opened(without)
-        methods.append(planned("ours without cells", other, other.references, cameras))
     methods += rivals(job, folder, tools)
     print(f"{run.name}: {len(cameras)} frames at {cameras[0].width} x {cameras[0].height}")
     for method in methods:
         print(f"  {method.name}: {len(method.piece_bytes)} pieces, {sum(method.piece_bytes) / 1e6:.2f} MB")
-    found = walk(methods, references, cameras)
+    found = walk(methods, job, cameras)
+    if without:
+        other = opened(without)
+        one_each = planned("ours without cells", other, other.references, cameras, BUDGETS)
+        found.insert(2, *walk([one_each], other, cameras))
     result = summary(found, job.ladder.size(job.ladder.levels[-1]), int(found[0].nbytes[0, -1]))
     print("\n".join(lines(result)))
     return result

@@ -1,4 +1,4 @@
-"""Our rows: equal levels, and what the planner takes for each frame."""
+"""Our rows: equal levels, and what the planner takes for each frame within a budget."""
 
 import gzip
 from collections.abc import Iterator, Sequence
@@ -7,16 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.runtime.measure import Shown
-from sagesplat.adapt.bound_plans import plan_for_view, quality_at
-from sagesplat.adapt.fidelity import References, distances_at
+from sagesplat.adapt.cell_plans import within
+from sagesplat.adapt.fidelity import References
 from sagesplat.formats.increments import INDEX, shown
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.methods import NestedLevels
-from sagesplat.stages.results import fidelity_of, increments_of
-
-TARGETS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85, 0.9, 0.93, 0.95, 0.97, 0.98, 0.99, 0.995, 1.0)
+from sagesplat.stages.results import increments_of
 
 
 def opened(run: Path) -> Job:
@@ -24,25 +22,21 @@ def opened(run: Path) -> Job:
     return Job(RunDir(run, "nested"), lambda event: None)
 
 
-def ladder_ids(job: Job) -> list[int]:
-    """What the ladder has levels of, ascending: the columns of all levels here."""
-    return sorted({label for label, _ in job.ladder.counts})
-
-
-def ours(job: Job, references: References, cameras: Sequence[Camera], targets: Sequence[float]) -> np.ndarray:
-    """The planner's levels, int [V, J, L] from 1 to K: by camera, target and the ladder's ids, ascending."""
-    costs = NestedLevels(job).costs
-    labels = list(costs.labels)
-    distance = distances_at(job.scene, job.point_labels, cameras, labels, job.fit_config.distance)
-    far = dict(zip(labels, distance.T.astype(np.float64), strict=True))
-    quality = quality_at(costs, fidelity_of(job), far, cameras, "fidelity")
-    found = np.ones((len(cameras), len(targets), len(labels)), np.int64)
-    for view, camera in enumerate(cameras):
-        pixels = references.at(camera).pixels.astype(np.float64)
-        for j, target in enumerate(targets):
-            plan = plan_for_view(quality, costs, target, view, pixels)
-            found[view, j] = [plan.levels[label] for label in labels]
-    return found
+def ours(job: Job, cameras: Sequence[Camera], shares: Sequence[float]) -> np.ndarray:
+    """The planner's levels of cells, int [F, 2 J, C] from 1 to K, within shares of all splats and bytes."""
+    method = NestedLevels(job)
+    expected, costs = method.expect(cameras), method.cell_costs
+    budgets = [
+        (cost, share * float(cost[:, -1].sum()))
+        for cost in (costs.count, costs.transfer_bytes)
+        for share in shares
+    ]
+    return np.array(
+        [
+            [within(cost, mean, share, budget) + 1 for cost, budget in budgets]
+            for mean, share in zip(expected.mean, expected.share, strict=True)
+        ]
+    )
 
 
 class Levels:
@@ -51,15 +45,15 @@ class Levels:
     def __init__(
         self, name: str, job: Job, references: References, settings: Sequence[float], levels: np.ndarray
     ):
-        self.name, self.settings, self._job, self._levels = name, settings, job, levels
-        self._references, self._ids = references, ladder_ids(job)
+        self.name, self.settings, self._levels = name, settings, levels
+        self._references, self._counts, self._ids = references, job.by_cell.counts, job.cells.ids.tolist()
         listed = increments_of(job)
         self.piece_bytes = np.array([one.nbytes for one in listed])
         self.index_bytes = index_bytes(job.run)
         at = {id(one): i for i, one in enumerate(listed)}
         self._pieces = {
-            (label, level): [at[id(one)] for one in shown(listed, label, level)]
-            for label in self._ids
+            (cell, level): [at[id(one)] for one in shown(listed, cell, level)]
+            for cell in self._ids
             for level in job.ladder.levels
         }
 
@@ -72,20 +66,22 @@ class Levels:
             needed = np.zeros(len(self.piece_bytes), bool)
             for of_level in levels.items():
                 needed[self._pieces[of_level]] = True
-            count = sum(self._job.ladder.counts[of_level] for of_level in levels.items())
+            count = sum(self._counts[of_level] for of_level in levels.items())
             yield Shown(seen.render(levels), count, needed)
 
 
 def equal_levels(job: Job, references: References, frames: int) -> Levels:
-    """All categories at one level."""
+    """All cells at one level."""
     K = len(job.ladder.levels)
-    levels = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (frames, K, len(ladder_ids(job))))
+    levels = np.broadcast_to(np.arange(1, K + 1)[None, :, None], (frames, K, len(job.cells.ids)))
     return Levels("equal levels", job, references, tuple(range(1, K + 1)), levels)
 
 
-def planned(name: str, job: Job, references: References, cameras: Sequence[Camera]) -> Levels:
-    """The planner's."""
-    return Levels(name, job, references, TARGETS, ours(job, references, cameras, TARGETS))
+def planned(
+    name: str, job: Job, references: References, cameras: Sequence[Camera], shares: Sequence[float]
+) -> Levels:
+    """The planner's within shares of all splats, and of all bytes."""
+    return Levels(name, job, references, (*shares, *shares), ours(job, cameras, shares))
 
 
 def index_bytes(run: RunDir) -> int:

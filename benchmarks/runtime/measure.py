@@ -6,8 +6,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from sagesplat.adapt.fidelity import PROMISED_SHARE, References
+from sagesplat.adapt.fidelity import PROMISED_SHARE
 from sagesplat.metrics.image import means_by_label, ssim_map
+from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 
@@ -75,17 +76,21 @@ class Walked:
         return float(enough.min(initial=np.inf))
 
 
-def walk(methods: Sequence[Method], references: References, cameras: Sequence[Camera]) -> list[Walked]:
-    """Measure every frame of every method at every setting."""
+def walk(methods: Sequence[Method], job: Job, cameras: Sequence[Camera]) -> list[Walked]:
+    """Measure every frame of every method at every setting, against the run's full model."""
+    references = job.references
+    ids, labels = job.cells.ids, job.cells.labels
     tables = [np.zeros((4, len(cameras), len(method.settings))) for method in methods]
     fetched = [np.zeros((len(method.settings), len(method.piece_bytes)), bool) for method in methods]
     for frame, camera in enumerate(cameras):
         at = references.at(camera)
+        known = at.label_ids >= ids[0]
+        label_ids = np.where(known, labels[np.searchsorted(ids, np.where(known, at.label_ids, ids[0]))], -1)
         for method, table, have in zip(methods, tables, fetched, strict=True):
             for j, shown in enumerate(method.shown(frame, camera)):
                 have[j] |= shown.needed
                 sent = method.index_bytes + int(method.piece_bytes[have[j]].sum())
-                table[:, frame, j] = *fidelity(shown.image, at.image, at.label_ids), shown.count, sent
+                table[:, frame, j] = *fidelity(shown.image, at.image, label_ids), shown.count, sent
     return [
         Walked(method.name, tuple(method.settings), *table)
         for method, table in zip(methods, tables, strict=True)

@@ -3,8 +3,8 @@
 Every cell begins at its lowest level. The upgrades of a cell in sight are the segments of the upper concave
 hull of (bytes, share * mean) over its levels, as in `adapt.fill`. Those of a category's cells are taken by
 falling slope, of equal ones the lower cell first, until sum share * mean >= needed * sum share: no other
-set of segments is cheaper by more than the last one.
-`web/src/core/planner.ts` does the same; tests/data/plans.json (mode "cells") checks both.
+set of segments is cheaper by more than the last one. Within a budget the steepest upgrades of all cells are
+taken that still fit. `web/src/core/planner.ts` does the same; tests/data/plans.json (mode "cells") checks it.
 """
 
 from dataclasses import dataclass
@@ -52,6 +52,45 @@ def reach(
     met = np.ones(len(needed), np.bool_)
     _reach(levels, np.ascontiguousarray(cost, np.float64), value, share * ~unknown, column, wanted, met)
     return Reach(levels, met)
+
+
+def within(
+    cost: Int[np.ndarray, "C K"],
+    mean: Float[np.ndarray, "C K"],
+    share: Float[np.ndarray, " C"],
+    budget: float,
+) -> Int[np.ndarray, " C"]:
+    """Columns of the levels that a budget in the unit of `cost` allows: the steepest upgrades that still fit.
+
+    All cells begin at their lowest level, whatever that costs; arguments as of `reach`.
+    """
+    value = np.where(share > 0, share, 0.0)[:, None] * np.nan_to_num(mean)
+    levels = np.zeros(len(share), np.int64)
+    _within(levels, np.ascontiguousarray(cost, np.float64), value, float(budget))
+    return levels
+
+
+@njit(cache=True, error_model="numpy")
+def _within(levels, cost, value, budget):
+    C = len(levels)
+    tops, slopes, left = np.empty(C, np.int64), np.empty(C), budget
+    for cell in range(C):
+        left -= cost[cell, 0]
+        tops[cell], slopes[cell] = next_upgrade(cost[cell], value[cell], 0)
+    while True:
+        best = -1
+        for cell in range(C):
+            if tops[cell] >= 0 and (best < 0 or slopes[cell] > slopes[best]):
+                best = cell
+        if best < 0:
+            break
+        more = cost[best, tops[best]] - cost[best, levels[best]]
+        if more > left:
+            tops[best] = -1  # what comes after it costs more still
+            continue
+        left -= more
+        levels[best] = tops[best]
+        tops[best], slopes[best] = next_upgrade(cost[best], value[best], levels[best])
 
 
 @njit(cache=True, error_model="numpy")

@@ -142,9 +142,8 @@ def _fit(
         found = sampled.fidelity[own, column].astype(np.float64)
         found[:, learnt] = offsets[i][learnt] + process.left_out[i]
         left_out[own, column] = monotone(found)
-        cells.append(
-            CellModel(part.ids[i], offsets[i], own, inputs[i][:, 7], medians[i], weights.T, factors[:, column])
-        )
+        log, v = inputs[i][:, 7], factors[:, column]
+        cells.append(CellModel(part.ids[i], offsets[i], own, log, medians[i], weights.T, v))
     # the category at equal levels, from its cells without the view
     weight = np.where(np.isnan(left_out[:, part.columns, 0]), 0, shares[:, part.columns])[rows]
     sums = np.einsum("vc,vck->vk", weight, np.nan_to_num(left_out[:, part.columns])[rows])

@@ -102,7 +102,8 @@ def _measure_compositions(
         )  # fmt: skip
         inner, photo = erode(masks[view]), as_unit(job.photos[row])
         for targets, levels in compositions:
-            found = measure(seen.render(ladder.of_cells(levels)), photo, masks[view], inner, job.valid[view], tiles)
+            image = seen.render(ladder.of_cells(levels))
+            found = measure(image, photo, masks[view], inner, job.valid[view], tiles)
             rows += [
                 (label, levels.get(label, -1), row, targets, values["ssim"])
                 for label, values in found.items()
