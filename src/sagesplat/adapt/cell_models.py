@@ -4,7 +4,8 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
 
     mean_uk  = offset_uk + sum_i c(x, x_i) weights_uik, made monotone       of cell u at level k; c, x: the
                kernel and the inputs of `adapt.process`, with the distance of the cell (`adapt.cells`)
-    share_u  = apparent_u * factor_u / max(1, sum over all cells)           of the picture's pixels
+    share_u  = apparent_u * factor_u / max(1, sum over all cells)           of the picture's pixels; of a cell
+                                                                            in sight at least 0.0001
     factor_u = (sum_i k_i v_ui + 0.001 v_u) / (sum_i k_i + 0.001)           k_i: by position and direction
                v_ui: true share over `apparent` in view i, what others leave of the cell; v_u: their mean
     mean     = sum_u share_u mean_u,level(u) / sum_u share_u                of the category's composition
@@ -37,6 +38,7 @@ from sagesplat.io.files import write_json
 from sagesplat.io.typed import read_json_as, refused, to_plain
 from sagesplat.scene.scene import Camera
 
+LEAST_SHARE = 1e-4  # of a cell in sight: it may be there though it was hidden in all known views
 MOST_FACTOR = 4.0  # of a share over what it would be unhidden
 _PRIOR = 1e-3  # weight of a factor's mean
 
@@ -143,6 +145,7 @@ def expect(
             factor[:, i] = visible_factor(near, cell.factors)
     share = sight.apparent * factor
     share /= np.maximum(share.sum(1, keepdims=True), 1)
+    share = np.where(sight.apparent > 0, np.maximum(share, LEAST_SHARE), 0)
     return Expected(cells.ids, labels, column, mean, share, support, away)
 
 

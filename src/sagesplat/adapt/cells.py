@@ -4,7 +4,7 @@ A cell is described by at most 16 points, each of which stands for an area: of t
 of the two longer axes' product times the opacity. From a viewpoint, with h_i the least signed height of a
 point over the planes of the frustum:
 
-    in_i     = clamp(1/2 + h_i / (2 radius), 0, 1)       radius: by how far Gaussians lie around the points
+    in_i     = clamp(1/2 + h_i / (2 radius), 0, 1)       radius: within it are 90 % of the Gaussians
     apparent = f_x f_y / (width height) * sum_i area_i in_i / distance_i^2
     distance = the weighted 25th percentile of distance_i, by area_i in_i
 
@@ -30,6 +30,7 @@ from sagesplat.scene.scene import Camera
 POINTS = 16  # of a cell
 STEPS = 255  # of positions within the bounds, and of areas
 PERCENTILE = 0.25
+_AROUND = 0.9  # share of a cell's Gaussians within its radius around the points
 _SAMPLE = 2000  # Gaussians of a cell that its points are found from
 
 
@@ -92,8 +93,7 @@ def _described(
     if len(some) > POINTS:
         points, nearest = kmeans2(means[some], POINTS, seed=0, minit="++", missing="warn")
     mine = np.bincount(nearest, weight, len(points))
-    away = means[some] - points[nearest]
-    radius = np.sqrt((weight * (away**2).sum(1)).sum() / max(weight.sum(), 1e-300) / 3)
+    radius = np.quantile(np.linalg.norm(means[some] - points[nearest], axis=1), _AROUND)
     kept = points[mine > 0] if (mine > 0).any() else points
     low, high = kept.min(0), kept.max(0)
     grid = np.zeros((POINTS, 4), np.uint8)
