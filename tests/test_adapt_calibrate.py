@@ -56,11 +56,13 @@ def test_critical_margins_by_trying_all(seed, levels):
 def test_critical_nominals_between_compositions():
     nominal, bound = np.array([0.4, 0.6, 0.8, 0.95]), np.array([[0.5, 0.62, 0.8, 1.0]])
 
-    def critical(measured, target=0.6):
-        return critical_nominals(nominal, bound, np.array([measured]), target)[0]
+    def critical(measured, steps=(4, 4, 4), target=0.6):
+        return critical_nominals(nominal, bound, np.array([steps]), np.array([measured]), target)[0]
 
-    assert critical([0.5, 0.7, 0.8, 1.0]) == pytest.approx(0.56)  # half of the way from what misses
-    assert critical([0.5, 0.55, 0.8, 1.0]) == pytest.approx(0.62 + 0.2 * 0.18)
+    assert critical([0.5, 0.7, 0.8, 1.0]) == pytest.approx(0.56)  # two of the four steps miss
+    assert critical([0.5, 0.7, 0.8, 1.0], (1, 4, 4)) == pytest.approx(0.5)  # the next one keeps
+    assert critical([0.5, 0.7, 0.8, 1.0], (0, 4, 4)) == 0.6  # by its neighbours alone
+    assert critical([0.5, 0.55, 0.8, 1.0]) == pytest.approx(0.62)
     assert critical([0.7, 0.75, 0.8, 1.0]) == 0.4  # nothing is known below the first one
-    assert critical([0.7, 0.5, 0.8, 1.0]) == pytest.approx(0.68)  # what keeps below what misses counts not
+    assert critical([0.7, 0.5, 0.8, 1.0]) == pytest.approx(0.62 + 0.18 / 4)  # what keeps below does not count
     assert critical([0.1, 0.2, 0.3, 0.4]) == 1.0  # nothing but the full model

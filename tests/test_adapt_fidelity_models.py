@@ -20,6 +20,7 @@ from sagesplat.adapt.fidelity_models import (
     photo_places,
     plan_nominal,
     remove_composition_bias,
+    trial_of,
 )
 from sagesplat.adapt.viewpoint import Calibration, away_from, where
 from sagesplat.core.errors import DataError
@@ -86,9 +87,7 @@ def trial(models, cameras: list[Camera], seed: int, spill: float = 0.0, shown=No
     planned = plan_nominal(models, expected, COST, NOMINAL)
     shown = np.ones((len(cameras), 2), bool) if shown is None else shown
     measured = by_category(truth(cameras, planned, seed, spill))
-    composed = [expected.of_composition(planned[:, j]) for j in range(len(NOMINAL))]
-    bound = np.stack([promised(models, expected, mean) for mean in composed], 1)
-    return Trial(LABELS, shown, expected.support, bound, measured)
+    return trial_of(models, expected, planned, shown, measured)
 
 
 def fitted(table: SampledFidelity, cameras: list[Camera], confidence: float = 0.95):

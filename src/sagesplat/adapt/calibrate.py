@@ -20,7 +20,7 @@ targets by preliminary thresholds. What is calibrated is the nominal target to a
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 AT_A_PHOTO = 0.2  # of the margin there, over what it grows by to far from all photos
 
@@ -54,21 +54,23 @@ def critical_margins(
 def critical_nominals(
     nominal: Float[np.ndarray, " J"],
     bound: Float[np.ndarray, "n J"],
+    steps: Int[np.ndarray, "n J-1"],
     measured: Float[np.ndarray, "n J"],
     target: float,
 ) -> Float[np.ndarray, " n"]:
-    """In each view, the nominal target from which on compositions keep the target.
+    """In each view, the largest nominal target for which a composition is taken that misses the target.
 
     Args:
         nominal: [J], ascending: the targets that compositions were planned for.
         bound: [n, J], what is promised of each: a composition is taken for all nominal targets up to that.
+        steps: [n, J - 1], compositions from each one to the next, that one included: levels between them.
         measured: [n, J], quality in the composition.
         target: That is to be kept.
 
     Returns:
-        [n]. Between the bounds of two compositions it is interpolated by what they measure; the first nominal
-        target where none misses; 1 where the last one does: nothing but the full model is known to keep the
-        target.
+        [n]. What compositions between two measure, and what is promised of them, is interpolated. The first
+        nominal target where none misses; 1 where the last one does: nothing but the full model is known to
+        keep the target.
     """
     n, J = measured.shape
     missed = measured < target
@@ -76,6 +78,9 @@ def critical_nominals(
     rows, after = np.arange(n), np.minimum(last + 1, J - 1)
     low, high = measured[rows, last], measured[rows, after]
     part = np.clip((target - low) / np.maximum(high - low, 1e-12), 0, 1)
-    found = bound[rows, last] + part * (bound[rows, after] - bound[rows, last])
-    found = np.maximum(found, nominal[last])
+    between = np.column_stack([steps, np.zeros(n, int)])[rows, last]
+    taken = np.minimum(np.floor(part * between), between - 1) / np.maximum(between, 1)
+    found = bound[rows, last] + taken * (bound[rows, after] - bound[rows, last])
+    # the same levels in both: their neighbours' levels made the difference
+    found = np.maximum(np.where(between > 0, found, nominal[after]), nominal[last])
     return np.where(missed.any(1), np.where(last == J - 1, 1.0, found), nominal[0])

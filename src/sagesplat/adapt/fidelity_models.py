@@ -27,7 +27,7 @@ from sagesplat.adapt.calibrate import (
     critical_nominals,
     fewest_views,
 )
-from sagesplat.adapt.cell_models import CellModel, Expected, FidelityModel, factors_of, needed
+from sagesplat.adapt.cell_models import CellModel, Expected, FidelityModel, factors_of, needed, promised
 from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.cells import Cells, Sight, look
 from sagesplat.adapt.fidelity import SampledFidelity
@@ -222,6 +222,20 @@ def plan_nominal(
     return planned
 
 
+def trial_of(
+    models: Mapping[int, FidelityModel],
+    expected: Expected,
+    planned: Int[np.ndarray, "V J C"],
+    shown: Bool[np.ndarray, "V L"],
+    fidelity: Float32[np.ndarray, "V J L"],
+) -> "Trial":
+    """What compositions of `plan_nominal` measured, beside what is promised of them."""
+    composed = [expected.of_composition(planned[:, j]) for j in range(len(NOMINAL))]
+    bound = np.stack([promised(models, expected, mean) for mean in composed], 1)
+    steps = np.diff(planned, axis=1) @ (expected.column[:, None] == np.arange(len(expected.labels)))
+    return Trial(expected.labels.tolist(), shown, expected.support, bound, np.maximum(steps, 0), fidelity)
+
+
 @dataclass(frozen=True, eq=False)
 class Trial:
     """Compositions planned for NOMINAL at viewpoints of one set, and what they measured."""
@@ -230,6 +244,7 @@ class Trial:
     shown: Bool[np.ndarray, "V L"]  # whether a viewpoint shows enough of a category to count
     support: Float[np.ndarray, "V L"]  # of the viewpoints; NaN without a model
     bound: Float[np.ndarray, "V J L"]  # what is promised of the compositions; NaN: nothing
+    steps: Int[np.ndarray, "V J-1 L"]  # by how many levels of its cells each composition is above the last
     fidelity: Float32[np.ndarray, "V J L"]  # what they measure
 
     def views(self, label: int) -> Int[np.ndarray, " n"]:
@@ -240,7 +255,8 @@ class Trial:
         """For each of TARGETS the critical nominal target in the viewpoints that show the category."""
         column, rows = list(self.labels).index(label), self.views(label)
         got, bound = self.fidelity[rows, :, column], np.nan_to_num(self.bound[rows, :, column], nan=1.0)
-        return np.stack([critical_nominals(NOMINAL, bound, got, target) for target in TARGETS])
+        steps = self.steps[rows, :, column]
+        return np.stack([critical_nominals(NOMINAL, bound, steps, got, target) for target in TARGETS])
 
     def missed(self, label: int) -> Int[np.ndarray, " J"]:
         """In how many of these viewpoints each of NOMINAL was missed."""

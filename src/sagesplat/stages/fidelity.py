@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs
-from sagesplat.adapt.cell_models import FidelityModel, expect, promised
+from sagesplat.adapt.cell_models import FidelityModel, expect
 from sagesplat.adapt.fidelity import measure_compositions, pooled_cells, shown_enough
 from sagesplat.adapt.fidelity_models import (
     NOMINAL,
@@ -15,6 +15,7 @@ from sagesplat.adapt.fidelity_models import (
     hold_all_categories,
     plan_nominal,
     remove_composition_bias,
+    trial_of,
 )
 from sagesplat.adapt.viewpoints import capture_cameras
 from sagesplat.core.config import FitConfig
@@ -64,9 +65,7 @@ def trial(models: Mapping[int, FidelityModel], compositions: "Compositions") -> 
     planned = plan_nominal(models, expected, cell_costs(job).transfer_bytes, NOMINAL)
     fidelity, pixels = compositions.measure(planned)
     shown = shown_enough(pixels, cameras)
-    composed = [expected.of_composition(planned[:, j]) for j in range(len(NOMINAL))]
-    bound = np.stack([promised(models, expected, mean) for mean in composed], 1)
-    return Trial(expected.labels.tolist(), shown, expected.support, bound, fidelity[..., :-1])
+    return trial_of(models, expected, planned, shown, fidelity[..., :-1])
 
 
 def cell_costs(job: Job) -> Costs:
