@@ -245,20 +245,24 @@ def _label(
 def _cells(contents: Contents) -> dict[int, list[dict[str, Any]]]:
     """By label id, the entries of its cells."""
     found: dict[int, list[dict[str, Any]]] = {}
-    cells = contents.shown
-    for row, (cell, label) in enumerate(cells.label_of.items()):
-        bounds, grid = (cells.bounds[row].reshape(2, 3) * FLIP), cells.grid[row].astype(int)
-        grid[:, :3] = np.where(FLIP < 0, STEPS - grid[:, :3], grid[:, :3])
-        entry = {
-            "id": cell,
-            "bounds": significant([*bounds.min(0), *bounds.max(0)]),
-            "points": grid[grid[:, 3] > 0].ravel().tolist() or grid[0].tolist(),
-            "area": significant(cells.area[row]),
-            "radius": significant(cells.radius[row], 4),
-            "levels": [_level(chunk) for chunk in contents.files[cell]],
-        }
-        found.setdefault(label, []).append(entry)
+    for row, (cell, label) in enumerate(contents.shown.label_of.items()):
+        levels = [_level(chunk) for chunk in contents.files[cell]]
+        found.setdefault(label, []).append({**placed(contents.shown, row), "levels": levels})
     return found
+
+
+def placed(cells: Cells, row: int) -> dict[str, Any]:
+    """Where a cell is, in the bundle's axes."""
+    bounds, grid = cells.bounds[row].reshape(2, 3) * FLIP, cells.grid[row].astype(int)
+    grid[:, :3] = np.where(FLIP < 0, STEPS - grid[:, :3], grid[:, :3])
+    used = grid[:, 3] > 0
+    return {
+        "id": int(cells.ids[row]),
+        "bounds": significant([*bounds.min(0), *bounds.max(0)]),
+        "points": (grid[used] if used.any() else grid[:1]).ravel().tolist(),
+        "area": significant(cells.area[row]),
+        "radius": significant(cells.radius[row], 4),
+    }
 
 
 def _level(chunk: Increment) -> dict[str, Any]:

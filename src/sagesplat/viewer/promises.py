@@ -360,7 +360,7 @@ def _differences(whole: np.ndarray) -> list[Any]:
 
 def _sent_views(views: int) -> slice:
     """Which of a number of views are sent."""
-    return slice(None, None, math.ceil(views / MOST_VIEWS))
+    return slice(None, None, max(1, math.ceil(views / MOST_VIEWS)))
 
 
 def _nearest(a: Float[np.ndarray, "A D"], b: Float[np.ndarray, "B D"]) -> Int[np.ndarray, " A"]:
