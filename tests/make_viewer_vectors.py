@@ -2,14 +2,15 @@
 
 A case of tests/data/distances.json has cells as in a manifest, a camera, the planes of its frustum (left,
 right, bottom, top, front) and the lens, and under "expected" by cell whether it is visible, the distance
-(null: out of sight) and the apparent size, and the distance of all cells as one label, to 1e-9 of themselves.
+(null: out of sight) and the apparent size, and the distance of all cells as one label, to 1e-5 of themselves: cameras here have single
+precision.
 A case of tests/data/promises.json has a document as in promises-*.json and viewpoints, with the focal length
 in pixels (null: that of the photos).
 Of SSIM against photos it has one label; a viewpoint has the distance, what it is corrected to, and the
 expected mean and bound by level and the support, to 1e-9 (null: NaN).
 Of fidelity it has the labels of a manifest too (id and cells); a viewpoint has planes and lens, and expected:
 by cell the share and, for cells in sight, the mean by level; `away`; and by label the support, the mean of a
-composition (`levels`: by cell, from 1) and its bound, to 1e-9 (null: NaN).
+composition (`levels`: by cell, from 1) and its bound, to 1e-5 (null: NaN).
 """
 
 import json
@@ -20,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sagesplat.adapt.cell_models import CellModel, FidelityModel, expect, promised
 from sagesplat.adapt.cells import POINTS, STEPS, Cells, label_distances, look
@@ -35,7 +35,7 @@ from sagesplat.adapt.viewpoint import (
     where,
 )
 from sagesplat.scene.scene import Camera
-from sagesplat.viewer.frames import FLIP, position
+from sagesplat.viewer.frames import FLIP, camera_at
 from sagesplat.viewer.manifest import placed
 from sagesplat.viewer.pack import Ladder, costs_of
 from sagesplat.viewer.promises import Seen, fidelity_document, ssim_document
@@ -63,12 +63,9 @@ def make_cells(seed: int, labels: Sequence[int], spread: float = 3.0) -> Cells:
 
 
 def posed(where: Any, quaternion: Any, focal: float = FOCAL) -> Camera:
-    """A camera at a pose in the bundle's axes, in double precision: a viewer gives the same to 1e-9."""
-    w2c = np.eye(4)
-    w2c[:3, :3] = (FLIP[:, None] * Rotation.from_quat(quaternion).as_matrix() * FLIP).T
-    w2c[:3, 3] = -w2c[:3, :3] @ (np.array(where, np.float64) * FLIP)
-    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-    return Camera(w2c, K, WIDTH, HEIGHT, (0, 0, 0))
+    """A camera at a pose in the bundle's axes."""
+    fov_y = 2 * math.atan(HEIGHT / (2 * focal))
+    return camera_at(np.array(where, np.float64), np.array(quaternion, np.float64), fov_y, WIDTH, HEIGHT)
 
 
 def seen_from(camera: Camera) -> Case:
@@ -76,8 +73,8 @@ def seen_from(camera: Camera) -> Case:
     wide, high = (n / (2 * float(camera.K[i, i])) for i, n in enumerate((WIDTH, HEIGHT)))
     normals = np.array([[1, 0, -wide], [-1, 0, -wide], [0, 1, -high], [0, -1, -high], [0, 0, -1]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    back = FLIP[:, None] * camera.w2c[:3, :3].T * FLIP  # camera to world
-    world, where = normals @ back.T, position(camera)
+    back = FLIP[:, None] * camera.w2c[:3, :3].T.astype(np.float64) * FLIP  # camera to world
+    world, where = normals @ back.T, -back @ (FLIP * camera.w2c[:3, 3].astype(np.float64))
     return {
         "position": where.tolist(),
         "direction": (camera.direction.astype(np.float64) * FLIP).tolist(),
