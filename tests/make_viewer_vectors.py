@@ -2,8 +2,8 @@
 
 A case of tests/data/distances.json has cells as in a manifest, a camera, the planes of its frustum (left,
 right, bottom, top, front) and the lens, and under "expected" by cell whether it is visible, the distance
-(null: out of sight) and the apparent size, and the distance of all cells as one label, to 1e-5 of themselves: cameras here have single
-precision.
+(null: out of sight) and the apparent size, and the distance of all cells as one label, to 1e-5 of themselves:
+cameras have single precision here.
 A case of tests/data/promises.json has a document as in promises-*.json and viewpoints, with the focal length
 in pixels (null: that of the photos).
 Of SSIM against photos it has one label; a viewpoint has the distance, what it is corrected to, and the

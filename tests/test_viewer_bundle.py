@@ -532,7 +532,8 @@ def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, content
 
 
 def test_without_points_or_labels() -> None:
-    entry, cells = CameraEntry("a", "test", camera()), describe_cells(G.select(torch.arange(0)), {})
+    entry = CameraEntry("a", "test", camera())
+    cells = Cells(**{name: array[:0] for name, array in vars(describe_cells(G, LABEL_OF)).items()})
     empty = Contents("none", 0.0, [entry], [], cells, [], Path("none"), 0)
     manifest, promises = documents(empty)
     assert promises == manifest["promises"] == {}
