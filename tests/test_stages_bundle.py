@@ -367,7 +367,7 @@ def test_a_run_with_levels_that_replace(run: Path, tmp_path: Path, viewer: Path)
     assert bundled.chunks == len(chunks)
     index = job.run.increments / "index.json"
     index.write_text(index.read_text().replace("REPLACE", "ADD"))
-    with pytest.raises(DataError, match=rf"Gaussians of category {label} is not this run's"):
+    with pytest.raises(DataError, match=rf"Gaussians of cell {label} is not this run's"):
         increments_of(job_of(run))
 
 

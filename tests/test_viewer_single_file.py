@@ -10,6 +10,7 @@ import pytest
 import torch
 from conftest import pinhole, random_gaussians
 
+from sagesplat.adapt.cells import describe_cells
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.formats.increments import write_increments
 from sagesplat.viewer import single_file
@@ -53,11 +54,9 @@ def contents(tmp_path: Path) -> Contents:
     chunks = write_increments(
         tmp_path / "chunks", g, sizes, {3: "car", 184: "tree"}, label_of={3: 3, 184: 184}
     )
-    unit = torch.tensor([[-1.0, -1, -1, 1, 1, 1]]).numpy()
-    categories = [Category(i, f"c{i}", f"c{i}", "#808080", unit) for i in sizes]
-    return Contents(
-        "tiny", 1.0, [CameraEntry("a.jpg", "train", pinhole())], categories, chunks, tmp_path / "chunks", 1
-    )
+    categories = [Category(i, f"c{i}", f"c{i}", "#808080") for i in sizes]
+    cells, cameras = describe_cells(g, {3: 3, 184: 184}), [CameraEntry("a.jpg", "train", pinhole())]
+    return Contents("tiny", 1.0, cameras, categories, cells, chunks, tmp_path / "chunks", 1)
 
 
 def test_everything_is_in_the_page(tmp_path, viewer, contents) -> None:
