@@ -52,10 +52,10 @@ def contents(tmp_path: Path) -> Contents:
     g = random_gaussians(30, degree=1).select(torch.arange(30))
     sizes = {label: (2, n) for label, n in g.counts().items()}
     chunks = write_increments(
-        tmp_path / "chunks", g, sizes, {3: "car", 184: "tree"}, label_of={3: 3, 184: 184}
+        tmp_path / "chunks", g, sizes, {3: "car", 184: "tree"}, label_of={i: i for i in sizes}
     )
     categories = [Category(i, f"c{i}", f"c{i}", "#808080") for i in sizes]
-    cells, cameras = describe_cells(g, {3: 3, 184: 184}), [CameraEntry("a.jpg", "train", pinhole())]
+    cells, cameras = describe_cells(g, {i: i for i in sizes}), [CameraEntry("a.jpg", "train", pinhole())]
     return Contents("tiny", 1.0, cameras, categories, cells, chunks, tmp_path / "chunks", 1)
 
 
