@@ -72,7 +72,7 @@ def test_everything_is_in_the_page(tmp_path, viewer, contents) -> None:
     manifest = json.loads(files.pop("manifest.json"))
     assert manifest["pack"] is None
     assert (files.pop("THIRD_PARTY_LICENSES.txt"), b"Apache" in files.pop("LICENSES.txt")) == (b"MIT", True)
-    levels = [level for label in manifest["labels"] for level in label["levels"]]
+    levels = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
     assert [hashlib.sha256(files[level["uri"]]).hexdigest() for level in levels] == [
         level["sha256"] for level in levels
     ]

@@ -119,9 +119,9 @@ def fidelity_document(
     place = np.argsort(order)
     head, shared, _ = _head("fidelity", some, some.views[order])
     views = shared / STEPS_PER_UNIT * AXES
-    entries = []
+    entries: list[dict[str, Any]] = []
     for label, model in models.items():
-        entry = {
+        entry: dict[str, Any] = {
             "id": label,
             "status": model.status,
             "confidence": model.confidence,
