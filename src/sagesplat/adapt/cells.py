@@ -150,7 +150,7 @@ def _percentile(
 ) -> Float[np.ndarray, " C"]:
     """The first distance up to which there is this part of the weights; NaN without any."""
     order = np.argsort(away, 1, kind="stable")
-    running = np.cumsum(np.take_along_axis(weight, order, 1), 1)
+    running: np.ndarray = np.cumsum(np.take_along_axis(weight, order, 1), 1)
     first = (running >= part * running[:, -1:]).argmax(1)
     near = np.take_along_axis(away, order, 1)[np.arange(len(order)), first]
     return np.where(running[:, -1] > 0, near, np.nan)
