@@ -1,9 +1,11 @@
-"""Test vectors of `adapt.allocate` and `adapt.fill`: `python tests/make_plans.py` writes them.
+"""Test vectors of `adapt.allocate`, `fill` and `cell_plans`: `python tests/make_plans.py` writes them.
 
 A case of tests/data/plans.json has the arguments of a function (null: NaN in quality, inf in cost, an
 argument left out) and under "expected" what it returns. Modes: "target" is `cheapest`, "budget" is
-`best_within`, either is `along` where quality has positions, "fill" is `fill` from "levels" on. Levels,
-status, cost, missed and optimal are to be equal, value and bound to 1e-9 of themselves.
+`best_within`, either is `along` where quality has positions, "fill" is `fill` from "levels" on, "cells" is
+`reach` for labels that need a mean "theta" (null: no promise) over their cells; cells out of sight, and those
+of a label of weight 0, have no share. Levels, status, cost, missed and optimal are to be equal, value and
+bound to 1e-9 of themselves.
 """
 
 import json
@@ -14,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from sagesplat.adapt.allocate import along, best_within, cheapest
+from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.fill import fill
 
 PATH = Path(__file__).parent / "data" / "plans.json"
@@ -138,6 +141,50 @@ def _fills() -> list[Case]:
     return found
 
 
+def _cells() -> list[Case]:
+    rng = np.random.default_rng(5)
+    found = []
+    for name, sizes, levels, theta in (
+        ("a cell", [1], 3, [0.7]),
+        ("cells of a label", [5], 4, [0.8]),
+        ("nothing to reach", [3], 4, [-1.0]),
+        ("out of reach", [3], 4, [0.995]),
+        ("no promise", [3, 2], 4, [None, 0.8]),
+        ("everything", [3, 2], 4, [1.0, 0.7]),
+        ("labels", [2, 6, 1, 4], 6, [0.6, 0.8, 0.9, 0.7]),
+        ("many", [16] * 8, 16, [0.9] * 8),
+    ):
+        labels = []
+        for n, wanted in zip(sizes, theta, strict=True):
+            quality, cost, _ = scene(rng, 1, n, levels)
+            mean = np.maximum.accumulate(quality[0], 1)
+            visible = rng.uniform(size=n) < 0.75
+            share = np.where(visible, rng.exponential(0.05, n).round(5) + 1e-5, 0.0)
+            cells = [
+                {"cost": c, "mean": m, "share": s, "visible": bool(s > 0)}
+                for c, m, s in zip(cost.tolist(), mean.tolist(), share.tolist(), strict=True)
+            ]
+            weight = 0.0 if name == "labels" and n == 1 else 1.0
+            labels.append({"cells": cells, "weight": weight, "theta": wanted})
+        found.append({"name": name, "mode": "cells", "labels": labels})
+    return found
+
+
+def reached(case: Case) -> list[list[int]]:
+    """The levels of the cells of a case's labels."""
+    labels = case["labels"]
+    every = [(i, label, cell) for i, label in enumerate(labels) for cell in label["cells"]]
+    found = reach(
+        np.array([cell["cost"] for _, _, cell in every], np.int64),
+        np.array([cell["mean"] for _, _, cell in every]),
+        np.array([cell["share"] if label["weight"] else 0.0 for _, label, cell in every]),
+        np.array([i for i, _, _ in every]),
+        np.array([math.nan if label["theta"] is None else label["theta"] for label in labels]),
+    ).levels
+    ends = np.cumsum([len(label["cells"]) for label in labels])
+    return [part.tolist() for part in np.split(found, ends[:-1])]
+
+
 def scene(rng: np.random.Generator, *shape: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Quality [P, L, K] as on a walk, cost [L, K] and weight [L] as in a scene, of 4 digits."""
     _, labels, levels = shape
@@ -181,6 +228,8 @@ def arguments(case: Case) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
 
 def expected(case: Case) -> Case:
     """What the implementation here makes of a case."""
+    if case["mode"] == "cells":
+        return {"levels": reached(case)}
     quality, cost, rest = arguments(case)
     if case["mode"] == "fill":
         weight = np.array(case["weight"], np.float64)
@@ -199,7 +248,8 @@ def cases() -> list[Case]:
             return [plain(v) for v in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    whole = [{key: plain(value) for key, value in case.items()} for case in _by_hand() + _random() + _fills()]
+    made = _by_hand() + _random() + _fills() + _cells()
+    whole = [{key: plain(value) for key, value in case.items()} for case in made]
     return [case | {"expected": expected(case)} for case in whole]
 
 

@@ -1,11 +1,16 @@
 """Test vectors of what the viewer evaluates: `python tests/make_viewer_vectors.py` writes them.
 
-A case of tests/data/distances.json has boxes, a camera, its half spaces and under "expected" the distance
-(null: nothing in sight), whether the category is visible and which boxes touch; also the half spaces within
-LENS, the photos', and the distance by them. Planes are to be equal to 1e-9, distances to 1e-9 of themselves.
-A case of tests/data/promises.json has a document as in promises-*.json with one label, and viewpoints with
-the focal length in pixels (null: that of the photos), the distance, what it is corrected to, and the expected
-mean and bound by level and the support, to 1e-9 (null: NaN).
+A case of tests/data/distances.json has cells as in a manifest, a camera, the planes of its frustum (left,
+right, bottom, top, front) and the lens, and under "expected" by cell whether it is visible, the distance
+(null: out of sight) and the apparent size, and the distance of all cells as one label, to 1e-5 of themselves:
+cameras have single precision here.
+A case of tests/data/promises.json has a document as in promises-*.json and viewpoints, with the focal length
+in pixels (null: that of the photos).
+Of SSIM against photos it has one label; a viewpoint has the distance, what it is corrected to, and the
+expected mean and bound by level and the support, to 1e-9 (null: NaN).
+Of fidelity it has the labels of a manifest too (id and cells); a viewpoint has planes and lens, and expected:
+by cell the share and, for cells in sight, the mean by level; `away`; and by label the support, the mean of a
+composition (`levels`: by cell, from 1) and its bound, to 1e-5 (null: NaN).
 """
 
 import json
@@ -17,112 +22,169 @@ from typing import Any
 
 import numpy as np
 
+from sagesplat.adapt.cell_models import CellModel, FidelityModel, expect, promised
+from sagesplat.adapt.cells import POINTS, STEPS, Cells, label_distances, look
 from sagesplat.adapt.eq3 import Eq3, SsimModel
+from sagesplat.adapt.process import inputs_of
 from sagesplat.adapt.viewpoint import (
     NO_CALIBRATION,
     PHOTOS_ONLY,
     Calibration,
     QualityKind,
     ViewModel,
-    constant_curve,
+    where,
 )
 from sagesplat.scene.scene import Camera
-from sagesplat.viewer import boxes
-from sagesplat.viewer.frames import FLIP
-from sagesplat.viewer.promises import Seen, promises_document
-from sagesplat.viewer.sent_model import read_model
+from sagesplat.viewer.frames import FLIP, camera_at
+from sagesplat.viewer.manifest import placed
+from sagesplat.viewer.pack import Ladder, costs_of
+from sagesplat.viewer.promises import Seen, fidelity_document, ssim_document
+from sagesplat.viewer.sent_model import read_fidelity, read_model
 
 DATA = Path(__file__).parent / "data"
 Case = dict[str, Any]
 
 AHEAD = (0.0, 0.0, 0.0, 1.0)
-UNIT = [[-1, -1, -6, 1, 1, -4]]
-LENS = (0.35, 0.3)  # half width and half height at distance 1
 FOCAL = 60.0  # of the photos, pixels
 SCREENS = (0.5, 2.0)
-ROOM = [[-3, -1, -3, 3, 1, 3], [-1, 0, -9, 1, 2, -7]]
+EXTENT = 4.5
+WIDTH, HEIGHT = 72, 48  # of pictures
 
 
-def _distance_case(
-    name: str, found: list, position: tuple, quaternion: tuple, fov_y: float, aspect: float
-) -> Case:
-    box, planes = (
-        np.array(found, np.float64).reshape(-1, 6),
-        boxes.frustum(position, quaternion, fov_y, aspect),
-    )
-    touches = boxes.touching(box, planes)
-    photo = boxes.photo_frustum(position, quaternion, fov_y, aspect, LENS)
-    camera = {"position": position, "quaternion": quaternion, "fovY": fov_y, "aspect": aspect}
+def make_cells(seed: int, labels: Sequence[int], spread: float = 3.0) -> Cells:
+    """Cells in COLMAP's axes, one for each label id of `labels`."""
+    rng, C = np.random.default_rng(seed), len(labels)
+    centre, size = rng.normal(0, spread, (C, 3)), rng.exponential(0.8, (C, 3))
+    grid = rng.integers(0, STEPS + 1, (C, POINTS, 4)).astype(np.uint8)
+    grid[:, 0, 3] = np.maximum(grid[:, 0, 3], 1)
+    bounds = np.concatenate([centre - size, centre + size], 1).round(4)
+    area, radius = rng.exponential(0.3, C).round(4) + 0.01, rng.exponential(0.2, C).round(3) + 1e-3
+    return Cells(np.arange(C), np.array(labels), bounds, grid, area, radius)
+
+
+def posed(where: Any, quaternion: Any, focal: float = FOCAL) -> Camera:
+    """A camera at a pose in the bundle's axes."""
+    fov_y = 2 * math.atan(HEIGHT / (2 * focal))
+    return camera_at(np.array(where, np.float64), np.array(quaternion, np.float64), fov_y, WIDTH, HEIGHT)
+
+
+def seen_from(camera: Camera) -> Case:
+    """A camera as the viewer has it."""
+    wide, high = (n / (2 * float(camera.K[i, i])) for i, n in enumerate((WIDTH, HEIGHT)))
+    normals = np.array([[1, 0, -wide], [-1, 0, -wide], [0, 1, -high], [0, -1, -high], [0, 0, -1]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    back = FLIP[:, None] * camera.w2c[:3, :3].T.astype(np.float64) * FLIP  # camera to world
+    world, where = normals @ back.T, -back @ (FLIP * camera.w2c[:3, 3].astype(np.float64))
     return {
-        "name": name, "boxes": box.tolist(), "camera": camera, "frustum": planes.tolist(),
-        "lens": LENS, "photo": photo.tolist(),
-        "expected": {
-            "distance": _plain(boxes.distance(box, position, planes)),
-            "inPhoto": _plain(boxes.distance(box, position, planes, photo)),
-            "visible": bool(touches.any()),
-            "touching": touches.tolist(),
-        },
-    }  # fmt: skip
+        "position": where.tolist(),
+        "direction": (camera.direction.astype(np.float64) * FLIP).tolist(),
+        "frustum": np.column_stack([world, -world @ where]).tolist(),
+        "lens": [wide, high],
+    }
+
+
+def _distance_case(name: str, cells: Cells, where: Any, quaternion: Any) -> Case:
+    camera = posed(where, quaternion)
+    sight = look(cells, [camera])
+    whole = label_distances(replace(cells, labels=np.zeros(len(cells.ids), int)), [camera])[0, 0]
+    expected = {
+        "visible": (sight.apparent[0] > 0).tolist(),
+        "distance": [_plain(value) for value in sight.distance[0]],
+        "apparent": sight.apparent[0].tolist(),
+        "whole": _plain(whole),
+    }
+    return {"name": name, "cells": cells_of(cells), "camera": seen_from(camera), "expected": expected}
+
+
+def cells_of(cells: Cells) -> list[Case]:
+    """The cells as a manifest has them, without levels."""
+    return [placed(cells, row) for row in range(len(cells.ids))]
 
 
 def distance_cases() -> list[Case]:
     """All cases of distances.json."""
-    origin, right = (0.0, 0.0, 0.0), (0.0, math.sin(-math.pi / 4), 0.0, math.cos(-math.pi / 4))
-    by_hand = [
-        ("ahead", UNIT, origin, AHEAD, 1.0, 1.5),
-        ("behind", [[-1, -1, 4, 1, 1, 6]], origin, AHEAD, 1.0, 1.5),
-        ("beside", [[4, -1, -2, 6, 1, -1]], origin, AHEAD, 1.0, 1.0),
-        ("beside, after a turn", [[4, -1, -2, 6, 1, -1]], origin, right, 1.0, 1.0),
-        ("inside", ROOM, origin, AHEAD, 1.0, 1.5),
-        ("a corner in sight and no sample", [[2.0, -1, -6, 8, 1, -5]], origin, AHEAD, 0.9, 0.9),
-        ("a flat box", [[-1, -1, -5, 1, -1, -3]], origin, AHEAD, 1.2, 1.0),
-        ("a point", [[0, 0, -5, 0, 0, -5]], origin, AHEAD, 1.2, 1.0),
-        ("no box", [], origin, AHEAD, 1.0, 1.0),
-        ("a portrait picture", [[1.2, -1, -6, 2.2, 1, -4]], origin, AHEAD, 1.2, 0.3),
+    one = make_cells(1, [7])
+    ahead = replace(one, bounds=np.array([[-1.0, -1, 4, 1, 1, 6]]))  # z is forward in COLMAP's axes
+    flat = replace(ahead, bounds=np.array([[-1.0, 1, 3, 1, 1, 5]]), radius=np.zeros(1))
+    right = (0.0, math.sin(-math.pi / 4), 0.0, math.cos(-math.pi / 4))
+    beside = replace(ahead, bounds=np.array([[4.0, -1, 1, 6, 1, 2]]))
+    cases = [
+        _distance_case("ahead", ahead, np.zeros(3), AHEAD),
+        _distance_case(
+            "behind", replace(ahead, bounds=-ahead.bounds[:, [3, 4, 5, 0, 1, 2]]), np.zeros(3), AHEAD
+        ),
+        _distance_case("beside", beside, np.zeros(3), AHEAD),
+        _distance_case("beside, after a turn", beside, np.zeros(3), right),
+        _distance_case(
+            "inside", replace(ahead, bounds=np.array([[-2.0, -2, -2, 2, 2, 2]])), np.zeros(3), AHEAD
+        ),
+        _distance_case("flat, without a radius", flat, np.zeros(3), AHEAD),
     ]
     rng = np.random.default_rng(8)
-    cases = [_distance_case(*case) for case in by_hand]
-    for i in range(24):
-        centre, size = rng.normal(0, 4, (int(rng.integers(1, 17)), 3)), rng.exponential(1.0, 3)
-        found = np.column_stack([centre - size, centre + size]).round(4).tolist()
+    for i in range(12):
         q = rng.normal(size=4)
-        q = (q / np.linalg.norm(q)).round(6)
-        fov_y, aspect = float(rng.uniform(0.4, 1.4).__round__(3)), float(rng.uniform(0.4, 2.2).__round__(3))
-        position = tuple(rng.normal(0, 4, 3).round(4).tolist())
-        cases.append(_distance_case(f"random {i}", found, position, tuple(q.tolist()), fov_y, aspect))
+        cells = make_cells(20 + i, [7] * int(rng.integers(1, 5)))
+        cases.append(
+            _distance_case(f"random {i}", cells, rng.normal(0, 2, 3).round(4), q / np.linalg.norm(q))
+        )
     return cases
 
 
-def model(
-    seed: int, views: int, levels: list[int], *, quality: QualityKind = "ssim", unseen: bool = True
-) -> ViewModel:
-    """A model of a category: of SSIM with curves of every kind, or of fidelity with constants."""
+def model(seed: int, views: int, levels: list[int], *, unseen: bool = True) -> ViewModel:
+    """A model of SSIM of a category, with curves of every kind."""
     rng = np.random.default_rng(seed)
-    last = (
-        np.array([level != levels[-1] for level in levels]) if quality == "fidelity" else np.ones(len(levels))
-    )
     position, direction = rng.normal(0, 0.7, (views, 3)), rng.normal(size=(views, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    screens = SCREENS if quality == "fidelity" else PHOTOS_ONLY
-    low, high = np.log(screens)
-    log_screen = rng.uniform(low, high, views)
     return ViewModel(
         label_id=7,
-        quality=quality,
-        curves=_constants(levels) if quality == "fidelity" else _curves(rng, levels),
-        extent=4.5,
+        quality="ssim",
+        curves=_curves(rng, levels),
+        extent=EXTENT,
         median_log_distance=float(rng.uniform(0.3, 1.2)),
         focal=FOCAL,
-        screens=screens,
-        inputs=np.column_stack([position, direction, log_screen, rng.normal(0.8, 0.4, views)]),
-        heldout_inputs=(np.arange(views) % 5 == 2) & unseen & (quality == "ssim"),
+        screens=PHOTOS_ONLY,
+        inputs=np.column_stack([position, direction, np.zeros(views), rng.normal(0.8, 0.4, views)]),
+        heldout_inputs=(np.arange(views) % 5 == 2) & unseen,
         lengths=tuple(rng.uniform(0.2, 1.2, 4).tolist()),  # pyright: ignore[reportArgumentType]
         heldout_variance=float(rng.uniform(0, 0.4)) * unseen,
-        photos=_photos(seed, 5 * (quality == "fidelity")),
-        weights=rng.normal(0, 0.05, (views, len(levels))) * last,
+        photos=np.zeros((6, 0)),
+        weights=rng.normal(0, 0.05, (views, len(levels))),
         rmse=0.03,
-        calibration=calibration(quality),
+        calibration=calibration("ssim"),
     )
+
+
+def fidelity_models(
+    cells: Cells, cameras: Sequence[Camera], levels: int, seed: int
+) -> dict[int, FidelityModel]:
+    """A model of fidelity for each category; every third cell has no views, and every fourth few factors."""
+    rng, found = np.random.default_rng(seed), {}
+    position, direction, screen = where(cameras, FOCAL)
+    ones = np.ones(len(cameras))
+    views = inputs_of(ones, position, direction, EXTENT, 0.0, np.clip(screen, *SCREENS))[:, :7]
+    for label in np.unique(cells.labels).tolist():
+        made = []
+        for i, cell in enumerate(cells.ids[cells.labels == label].tolist()):
+            rows = np.flatnonzero(rng.uniform(size=len(views)) < (0.0 if cell % 3 == 2 else 0.7))
+            factors = np.where(rng.uniform(size=len(views)) < (0.9 if i % 4 == 3 else 0.3), -1.0, 0.0)
+            factors = np.where(factors < 0, factors, rng.uniform(0, 1.5, len(views)))
+            offsets = np.append(np.sort(rng.uniform(0.6, 0.98, levels - 1)), 1.0)
+            weights = rng.normal(0, 0.03, (levels, len(rows))) * (np.arange(levels) < levels - 1)[:, None]
+            logs = rng.normal(0.8, 0.4, len(rows))
+            made.append(CellModel(cell, offsets, rows, logs, 0.7, weights, factors))
+        found[label] = FidelityModel(
+            label_id=label,
+            extent=EXTENT,
+            focal=FOCAL,
+            screens=SCREENS,
+            views=views,
+            lengths=tuple(rng.uniform(0.3, 1.2, 4).tolist()),  # pyright: ignore[reportArgumentType]
+            photos=_photos(seed, 5),
+            cells=tuple(made),
+            rmse=0.03,
+            calibration=replace(calibration("fidelity"), least_support=0.05),
+        )
+    return found
 
 
 def _photos(seed: int, count: int) -> np.ndarray:
@@ -140,13 +202,6 @@ def calibration(quality: QualityKind) -> Calibration:
         targets, thresholds = np.append(targets, 1.0), np.append(thresholds, 1.0)
         slopes = np.append(slopes, 0.0)
     return Calibration("calibrated", 0.95, 40, targets, thresholds, slopes, 0.3)
-
-
-def _constants(levels: list[int]) -> tuple[SsimModel, ...]:
-    means = np.linspace(0.6, 1, len(levels)) if len(levels) > 1 else [1.0]
-    return tuple(
-        constant_curve(7, level, float(mean), 0.01, 40) for level, mean in zip(levels, means, strict=True)
-    )
 
 
 def _curves(rng: np.random.Generator, levels: list[int]) -> tuple[SsimModel, ...]:
@@ -179,21 +234,20 @@ def cameras_at(made: ViewModel) -> list[Camera]:
     return cameras
 
 
-def _promise_case(name: str, made: ViewModel, seed: int) -> Case:
+def _ssim_case(name: str, made: ViewModel, seed: int) -> Case:
     rng = np.random.default_rng(seed)
     n = made.num_views
     seen = Seen(rng.uniform(0, 0.3, n), np.full(n, np.nan), rng.normal(0, 0.2, n))
-    document = promises_document(made.quality, {made.label_id: made}, cameras_at(made), {made.label_id: seen})
+    document = ssim_document({made.label_id: made}, cameras_at(made), {made.label_id: seen})
     sent = read_model(document, made.label_id)
-    position, direction = rng.normal(0, 3, (8, 3)), rng.normal(size=(8, 3))
+    position, direction = rng.normal(0, 3, (6, 3)), rng.normal(size=(6, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     for i in (0, 2, 3):  # a known view, and viewpoints beside it: the support is large enough
         position[i] = made.inputs[0, :3] * made.extent + 0.05 * i
         direction[i] = made.inputs[0, 3:6]
     position[1] = 1e3  # far from all
-    away = np.array([math.exp(made.inputs[0, 7]), 2.0, math.nan, 2.1, 1.9999, 3.3, 50.0, 5.0])
-    # on the view's own screen, on that of the photos, and on some beyond both ends of what is known
-    screen = np.array([math.exp(made.inputs[0, 6]), 1.0, 0.5, 2.0, 1.3, 0.7, 0.1, 9.0])
+    away = np.array([math.exp(made.inputs[0, 7]), 2.0, math.nan, 2.1, 1.9999, 50.0])
+    screen = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 0.1])
     told = sent.predict(away, position, direction, screen)
     right = sent.corrected(away, position, direction)
     points = [
@@ -209,33 +263,81 @@ def _promise_case(name: str, made: ViewModel, seed: int) -> Case:
     return {"name": name, "promises": document, "viewpoints": points}
 
 
+def drawn_cameras(seed: int, count: int) -> list[Camera]:
+    """Cameras around the origin that look in all directions, on screens of SCREENS and beyond."""
+    rng = np.random.default_rng(seed)
+    cameras = []
+    for _ in range(count):
+        q = rng.normal(size=4)
+        where, focal = rng.normal(0, 2.5, 3), FOCAL * float(rng.uniform(0.4, 2.2))
+        cameras.append(posed(where, q / np.linalg.norm(q), focal))
+    return cameras
+
+
+def fidelity_case(name: str, labels: Sequence[int], views: int, levels: int, seed: int) -> Case:
+    """A case of fidelity; every fifth cell has one file less."""
+    cells, cameras = make_cells(seed, labels, 2.5), drawn_cameras(seed, views)
+    models = fidelity_models(cells, cameras, levels, seed)
+    files = {c: list(range(1 + (c % 5 == 4 and levels > 1), levels + 1)) for c in cells.ids.tolist()}
+    cost = costs_of([Ladder([1000 + 10 * c] * len(files[c])) for c in cells.ids.tolist()])
+    document = fidelity_document(models, files, levels, cells, cost, cameras)
+    there = [*cameras[:3], *drawn_cameras(seed + 1, 4), posed((900.0, 0, 0), AHEAD)]
+    sent = read_fidelity(document)
+    expected = expect(sent, cells, there, cost.shape[1])
+    rng = np.random.default_rng(seed)
+    composed = 1 + (
+        rng.uniform(size=expected.share.shape) * [len(files[c]) for c in cells.ids.tolist()]
+    ).astype(int)
+    mean = expected.of_composition(composed)
+    bound = promised(sent, expected, mean)
+    points = [
+        {
+            **seen_from(camera),
+            "focal": float(camera.focal),
+            "levels": composed[i].tolist(),
+            "expected": {
+                "share": expected.share[i].tolist(),
+                "means": [
+                    expected.mean[i, c, : len(files[cell])].tolist() if expected.share[i, c] > 0 else None
+                    for c, cell in enumerate(cells.ids.tolist())
+                ],
+                "away": float(expected.away[i]),
+                "support": expected.support[i].tolist(),
+                "mean": [_plain(value) for value in mean[i]],
+                "bound": [_plain(value) for value in bound[i]],
+            },
+        }
+        for i, camera in enumerate(there)
+    ]
+    listed = [
+        {"id": label, "cells": [placed(cells, row) for row in np.flatnonzero(cells.labels == label)]}
+        for label in np.unique(cells.labels).tolist()
+    ]
+    for label in listed:
+        for cell in label["cells"]:
+            cell["numLevels"] = len(files[cell["id"]])
+    return {"name": name, "labels": listed, "promises": document, "viewpoints": points}
+
+
 def promise_cases() -> list[Case]:
     """All cases of promises.json, in the frame of a bundle."""
     nothing = replace(model(2, 6, [1, 2, 3]), calibration=NO_CALIBRATION)
-    many = model(9, 30, [1, 2, 3, 4, 5, 6], quality="fidelity")
-    # slopes of both signs, by which thresholds overtake each other, and those that would exceed 1
-    crossing = replace(many, calibration=_with_slopes(many, [0.6, -0.4, 0.2, 0.3, 0.05, -0.1, 0.0]))
-    inputs = many.inputs.copy()
-    inputs[:, 6] = math.log(1.2)
-    one_screen = replace(many, screens=(1.2, 1.2), inputs=inputs)
-    steep = replace(many, calibration=_with_slopes(many, [0.1, 0.8, 1.5, 2.0, 4.0, 8.0, 0.0]))
+    steep = replace(model(5, 20, [1, 2, 3]), calibration=_with_slopes([0.6, -0.4, 0.2, 0.3, 0.05, -0.1]))
     return [
-        _promise_case("one view, one level", model(1, 1, [1]), 1),
-        _promise_case("curves of three kinds", model(2, 6, [1, 2, 3]), 2),
-        _promise_case("levels without a promise", model(3, 9, [2, 3, 5]), 3),
-        _promise_case("no view unseen", model(4, 12, [1, 2, 3, 4], unseen=False), 4),
-        _promise_case("many views", model(5, 40, [1, 2, 3, 4, 5, 6]), 5),
-        _promise_case("fidelity", model(6, 20, [1, 2, 3, 4, 5], quality="fidelity"), 6),
-        _promise_case("fidelity, one level", model(7, 3, [1], quality="fidelity"), 7),
-        _promise_case("no target that can be kept", nothing, 8),
-        _promise_case("thresholds that overtake each other", crossing, 9),
-        _promise_case("thresholds beyond 1", steep, 10),
-        _promise_case("one screen", one_screen, 11),
+        _ssim_case("one view, one level", model(1, 1, [1]), 1),
+        _ssim_case("curves of three kinds", model(2, 6, [1, 2, 3]), 2),
+        _ssim_case("levels without a promise", model(3, 9, [2, 3, 5]), 3),
+        _ssim_case("no view unseen", model(4, 12, [1, 2, 3, 4], unseen=False), 4),
+        _ssim_case("no target that can be kept", nothing, 8),
+        _ssim_case("thresholds that overtake each other", steep, 9),
+        fidelity_case("fidelity, a cell", [7], 3, 2, 11),
+        fidelity_case("fidelity, cells of a label", [7] * 5, 16, 4, 12),
+        fidelity_case("fidelity, cells of labels", [3, 3, 7, 7, 7, 7, 9, 9], 20, 5, 13),
     ]
 
 
-def _with_slopes(made: ViewModel, slopes: Sequence[float]) -> Calibration:
-    return replace(made.calibration, slopes=np.array(slopes), least_support=0.0)
+def _with_slopes(slopes: Sequence[float]) -> Calibration:
+    return replace(calibration("ssim"), slopes=np.array(slopes), least_support=0.0)
 
 
 def _plain(value: float) -> float | None:

@@ -219,14 +219,17 @@ def test_the_command(files, monkeypatch, command):
 
 
 CHUNK = {"uri": "chunks/a.spz", "count": 3, "bytes": 9, "gpuBytes": 9, "sha256": "0" * 64}
-LABEL = {"id": 3, "title": "car", "levels": [CHUNK]}
+LABEL = {"id": 3, "title": "car", "cells": [{"id": 0, "levels": [CHUNK]}]}
 
 
 @pytest.mark.parametrize(
     "labels",
     [
-        *(4, [], [LABEL | {"id": "x"}], [LABEL | {"levels": [4]}]),
-        *([LABEL | {"levels": [CHUNK | change]}] for change in ({"uri": "chunks/../a"}, {"count": -1})),
+        *(4, [], [LABEL | {"id": "x"}], [LABEL | {"cells": [4]}]),
+        *(
+            [LABEL | {"cells": [{"id": 0, "levels": [CHUNK | change]}]}]
+            for change in ({"uri": "chunks/../a"}, {"count": -1})
+        ),
     ],
 )
 def test_damaged_bundles_are_one_line(tmp_path, labels):

@@ -1,4 +1,4 @@
-"""Bundles as files: boxes and distances, which way is up, rounding, the manifest and its schema."""
+"""Bundles as files: cells, which way is up, rounding, the manifest and its schema."""
 
 import hashlib
 import json
@@ -15,10 +15,21 @@ from conftest import pinhole, random_gaussians
 from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
-from make_viewer_vectors import DATA, cameras_at, distance_cases, model, promise_cases
+from make_viewer_vectors import (
+    DATA,
+    cameras_at,
+    distance_cases,
+    drawn_cameras,
+    fidelity_models,
+    make_cells,
+    model,
+    promise_cases,
+)
 from scipy.spatial.transform import Rotation
 
-from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel
+from sagesplat.adapt.cell_models import expect, promised
+from sagesplat.adapt.cells import POINTS, Cells, describe_cells
+from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, ViewModel
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.increments import write_increments
@@ -26,20 +37,28 @@ from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
 from sagesplat.formats.stream_increments import write_streams
 from sagesplat.scene.scene import Camera
-from sagesplat.viewer import boxes, frames, promises
+from sagesplat.viewer import frames, promises
 from sagesplat.viewer.built import has_viewer
 from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
-from sagesplat.viewer.pack import Ladder, gains_of, order_of
-from sagesplat.viewer.promises import Seen, allowed_change, promises_document
-from sagesplat.viewer.quality import curve_entry, curve_of, of_files, quality_entry, significant
-from sagesplat.viewer.sent_model import SentModel, read_model
+from sagesplat.viewer.pack import Ladder, costs_of, gains_of, order_of
+from sagesplat.viewer.promises import Seen, allowed_change, fidelity_document, of_cells, ssim_document
+from sagesplat.viewer.quality import (
+    curve_entry,
+    curve_of,
+    levels_of,
+    of_levels,
+    quality_entry,
+    significant,
+)
+from sagesplat.viewer.sent_model import SentModel, read_fidelity, read_model
 
-UNIT = np.array([[-1.0, -1, -1, 1, 1, 1]])
-SIZES = {-1: (4, 4, 10), 3: (3, 6, 20), 184: (0, 5, 9)}
+SIZES = {0: (4, 4, 10), 1: (3, 6, 12), 2: (2, 5, 8), 3: (0, 5, 9)}  # of cells
+LABEL_OF = {0: -1, 1: 3, 2: 3, 3: 184}
 NAMES = {3: "car", 184: "tree"}
-G = replace(random_gaussians(39, degree=1), label_ids=torch.tensor([-1] * 10 + [3] * 20 + [184] * 9).short())
+CELL_IDS = torch.repeat_interleave(torch.arange(4), torch.tensor([10, 12, 8, 9])).short()
+G = replace(random_gaussians(39, degree=1), label_ids=CELL_IDS)
 
 
 def camera(angle: float = 0.0, tilt: float = 0.0, at: tuple = (0.0, 0.0, 0.0)) -> Camera:
@@ -48,70 +67,6 @@ def camera(angle: float = 0.0, tilt: float = 0.0, at: tuple = (0.0, 0.0, 0.0)) -
     w2c[:3, :3] = Rotation.from_euler("yx", [angle, tilt]).as_matrix()
     w2c[:3, 3] = -w2c[:3, :3] @ np.array(at, np.float32)
     return replace(pinhole(), w2c=w2c)
-
-
-# boxes
-
-
-@given(st.integers(0, 300), st.integers(0, 5))
-def test_boxes_share_the_points_evenly(count: int, power: int) -> None:
-    points = np.random.default_rng(count).normal(size=(count, 3))
-    found = boxes.split_boxes(points, 2**power)
-    assert len(found) == min(count, 2**power) or count > 20  # some may be outliers
-    assert len(found) <= 2**power
-    assert (found[:, :3] <= found[:, 3:]).all()
-    if count:
-        assert (found[:, :3] >= points.min(0)).all()
-        assert (found[:, 3:] <= points.max(0)).all()
-
-
-def test_boxes_leave_out_points_that_are_far_from_all() -> None:
-    points = np.random.default_rng(0).uniform(size=(500, 3))
-    stray = np.array([[100.0, 0, 0], [0, -100, 0]])
-    assert np.abs(boxes.split_boxes(np.concatenate([points, stray]))).max() <= 1
-
-
-def test_a_frustum_holds_what_the_camera_projects_into_its_picture() -> None:
-    at = replace(
-        camera(0.4, 0.3, (0.5, 1, -2)), K=np.array([[60, 0, 35], [0, 60, 25], [0, 0, 1]], np.float32)
-    )
-    points = np.random.default_rng(1).normal(0, 6, (500, 3))
-    local = points @ at.w2c[:3, :3].T + at.w2c[:3, 3]
-    pixels = local[:, :2] / local[:, 2:] * 60 + [35, 25]
-    inside = (local[:, 2] > 0) & ((pixels >= 0) & (pixels < [at.width, at.height])).all(1)
-    planes = boxes.frustum(frames.position(at), frames.quaternion(at).tolist(), frames.fov_y(at), 70 / 50)
-    found = ((points * FLIP) @ planes[:, :3].T + planes[:, 3] >= 0).all(1)
-    assert 20 < inside.sum() < 200
-    np.testing.assert_array_equal(found, inside)
-
-
-@given(st.integers(0, 1000))
-def test_distance_lies_between_the_nearest_and_the_farthest_corner(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    centre, size = rng.normal(0, 4, (5, 3)), rng.uniform(0, 2, (5, 3))
-    found = np.concatenate([centre - size, centre + size], 1)
-    planes = boxes.frustum((0, 0, 0), rng.normal(size=4).tolist(), rng.uniform(0.3, 2), rng.uniform(0.3, 3))
-    seen = boxes.touching(found, planes)
-    told = boxes.distance(found, (0, 0, 0), planes)
-    assert math.isnan(told) == (not seen.any())
-    if seen.any():
-        near = np.linalg.norm(np.maximum(np.maximum(found[:, :3], -found[:, 3:]), 0), axis=1)[seen]
-        far = np.linalg.norm(np.abs(centre) + size, axis=1)[seen]
-        assert near.min() <= told <= far.max()
-
-
-def test_a_window_higher_than_the_photos_knows_the_distances_of_the_photos() -> None:
-    """The ground from one's feet on: a phone held upright sees nearer parts of it than any photo."""
-    ground = boxes.split_boxes(np.random.default_rng(0).uniform([-8, -1.6, -20], [8, -1.5, 0], (4000, 3)))
-    pose, lens = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), (0.55, 0.4)
-    photo = boxes.distance(ground, pose[0], boxes.frustum(*pose, 2 * math.atan(0.4), 0.55 / 0.4))
-    phone = 2 * math.atan(1.2), 0.46
-    window, inside = boxes.frustum(*pose, *phone), boxes.photo_frustum(*pose, *phone, lens)
-    assert boxes.distance(ground, pose[0], window) < 0.85 * photo
-    assert boxes.distance(ground, pose[0], window, inside) == pytest.approx(photo, rel=0.05)
-    feet = np.array([[-0.1, -1.6, -2.0, 0.1, -1.5, -1.8]])  # in no photo from here
-    assert boxes.distance(feet, pose[0], window, inside) == boxes.distance(feet, pose[0], window) > 0
-    np.testing.assert_array_equal(boxes.photo_frustum(*pose, 0.5, 1.0, lens), boxes.frustum(*pose, 0.5, 1.0))
 
 
 def test_shared_vectors_are_what_is_computed() -> None:
@@ -198,15 +153,12 @@ def assert_close_means(read: SentModel, made: ViewModel, *at: np.ndarray) -> Non
 def sent(made: ViewModel, seen: Seen | None = None) -> dict[str, Any]:
     """The document of a model, as it is read."""
     known = {} if seen is None else {made.label_id: seen}
-    return json.loads(
-        json.dumps(promises_document(made.quality, {made.label_id: made}, cameras_at(made), known))
-    )
+    return json.loads(json.dumps(ssim_document({made.label_id: made}, cameras_at(made), known)))
 
 
-@pytest.mark.parametrize("quality", ["fidelity", "ssim"])
 @pytest.mark.parametrize(("seed", "views"), [(2, 1), (3, 12), (5, 40)])
-def test_a_model_that_is_sent_predicts_the_same(quality, seed: int, views: int) -> None:
-    made = model(seed, views, [1, 2, 4], quality=quality)
+def test_a_model_that_is_sent_predicts_the_same(seed: int, views: int) -> None:
+    made = model(seed, views, [1, 2, 4])
     read = read_model(sent(made), made.label_id)
     before, after = made.predict(*own_views(made)), read.predict(*own_views(made))
     assert_close_means(read, made, *own_views(made))
@@ -214,35 +166,9 @@ def test_a_model_that_is_sent_predicts_the_same(quality, seed: int, views: int) 
     assert (after.bound <= before.bound + 1e-12)[asked].all()  # nothing is promised that was not before
     np.testing.assert_allclose(after.bound, before.bound, atol=0.1)  # thresholds are 0.05 apart at 0.55
     np.testing.assert_allclose(after.support, before.support, atol=0.02)
-    if quality == "fidelity":
-        assert (after.bound[:, -1] == 1).all()
     nowhere = np.array([2.0, np.nan]), np.full((2, 3), 1e3), np.eye(3)[:2]
     assert np.isnan(read.predict(*nowhere).bound).all()
     assert_close_means(read, made, *nowhere)
-
-
-@pytest.mark.parametrize("slopes", [[0.1, -0.6, 0.3, 0.5, -0.2, 2.0, 0.0], [3.0] * 6 + [0.0]])
-def test_thresholds_that_rise_and_fall_with_the_support_promise_no_more_when_sent(slopes) -> None:
-    made = model(6, 20, [1, 2, 3, 4], quality="fidelity")
-    made = replace(made, calibration=replace(made.calibration, slopes=np.array(slopes)))
-    read = read_model(sent(made), made.label_id)
-    distance, position, direction, screen = own_views(made)
-    for at in (own_views(made), (distance, position, direction, screen * 1.3)):
-        before, after = made.predict(*at), read.predict(*at)
-        asked = before.bound >= made.calibration.targets[0]
-        assert (after.bound <= before.bound + 1e-12)[asked].all()
-        assert (after.bound[:, -1] == 1).all()
-
-
-def test_screens_beyond_those_that_are_known_count_as_the_nearer_end() -> None:
-    made = model(6, 20, [1, 2, 3, 4], quality="fidelity")
-    read, at = read_model(sent(made), made.label_id), own_views(made)[:3]
-    for one in (made, read):
-        for inside, beyond in ((2.0, 9.0), (0.5, 0.01)):
-            known, told = (one.predict(*at, np.full(20, screen)) for screen in (inside, beyond))
-            np.testing.assert_array_equal(known.bound, told.bound)
-        np.testing.assert_array_equal(one.predict(*at).mean, one.predict(*at, np.ones(20)).mean)
-        assert np.abs(one.predict(*at, np.full(20, 2.0)).mean - one.predict(*at).mean).max() > 1e-3
 
 
 def test_of_very_many_views_some_are_sent_and_thresholds_allow_for_it(monkeypatch) -> None:
@@ -261,16 +187,15 @@ def test_thresholds_that_are_close_never_promise_more() -> None:
     targets = np.array([0.5, 0.6, 0.7, 0.98, 1.0])
     close = np.array([0.5, 0.50000001, 0.50000002, 0.99999999, 1.0])
     made = replace(
-        model(3, 12, [1, 2], quality="fidelity"),
+        model(3, 12, [1, 2]),
         calibration=Calibration("uncalibrated", 0.95, 3, targets, close, np.zeros(5), 0.123456),
     )
     (entry,) = sent(made)["labels"]
     assert entry["targets"][:3] == [5000, 6000, 7000]
-    assert entry["targets"][-1] == 10000
+    assert (entry["targets"][-1], entry["thresholds"][-1]) == (10000, 10000)
     read = read_model(sent(made), made.label_id).calibration
     below = np.linspace(0.51, 0.9997, 200)[None]  # targets of the full model lend nothing to what is below it
     assert (read.bound(below, np.ones(1)) <= made.calibration.bound(below, np.ones(1)) + 1e-9).all()
-    assert entry["thresholds"][-1] == 10000
     assert (np.diff(entry["thresholds"][:4]) >= 0).all()
     assert entry["leastSupport"] == 0.1235  # up: no promise that was not given
     assert entry["status"] == "uncalibrated"
@@ -280,12 +205,49 @@ def test_thresholds_that_are_close_never_promise_more() -> None:
 
 
 def test_the_first_frame_knows_a_mean_and_a_bound_for_all_viewpoints() -> None:
-    made = model(5, 40, [1, 2, 3], quality="fidelity")
+    made = model(5, 40, [1, 2, 3])
     told, entry = made.predict(*own_views(made)), quality_entry(made)
     np.testing.assert_allclose(entry["mean"], told.mean.mean(0), atol=1e-3)
     assert ((told.bound >= np.array(entry["bound"])).mean(0) >= 0.95).all()
-    assert entry["bound"][-1] == 1
     assert quality_entry(replace(made, calibration=NO_CALIBRATION))["bound"] is None
+
+
+# fidelity
+
+
+@pytest.mark.parametrize(
+    ("labels", "views", "seed"), [([7], 4, 1), ([7] * 6, 24, 2), ([3, 3, 7, 7, 9], 24, 3)]
+)
+def test_compositions_are_promised_no_more_than_before_they_were_sent(labels, views, seed) -> None:
+    cells, drawn = make_cells(seed, labels, 2.5), drawn_cameras(seed, views)
+    models = fidelity_models(cells, drawn, 5, seed)
+    files = {cell: [1, 2, 3, 4, 5] for cell in cells.ids.tolist()}
+    cost = np.tile(np.arange(1, 6) * 1000, (len(labels), 1))
+    document = json.loads(json.dumps(fidelity_document(models, files, 5, cells, cost, drawn)))
+    read = read_fidelity(document)
+    before, after = (expect(some, cells, drawn, 5) for some in (models, read))
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        levels = rng.integers(1, 6, before.share.shape)
+        known = promised(models, before, before.of_composition(levels))
+        told = promised(read, after, after.of_composition(levels))
+        asked = (known >= 0.3) & np.isfinite(told)
+        assert (told[asked] <= known[asked] + 5e-3).all()
+        assert (np.isfinite(told) <= np.isfinite(known)).all()
+    np.testing.assert_allclose(after.share, before.share, atol=0.02)
+    full = promised(read, after, after.of_composition(np.full(before.share.shape, 5)))
+    assert (full[np.isfinite(full)] == 1).all()
+
+
+def test_cells_of_fewer_files_have_fewer_levels() -> None:
+    cells, drawn = make_cells(4, [7, 7], 2.5), drawn_cameras(4, 12)
+    models = fidelity_models(cells, drawn, 4, 4)
+    kept = of_cells(models, {0: [1, 3], 1: [1, 2, 3, 4]}, 4)[7]
+    offsets = [cell.offsets for cell in models[7].cells]
+    np.testing.assert_array_equal(kept.cells[0].offsets, offsets[0][[1, 3, 3, 3]])
+    np.testing.assert_array_equal(kept.cells[1].offsets, offsets[1])
+    assert levels_of([[1, 3], [1, 2, 3, 4]], 4) == [1, 2, 3, 4]
+    assert levels_of([[1, 3], [1, 4]], 4) == [2, 4]
 
 
 def test_the_first_view_is_level() -> None:
@@ -299,7 +261,7 @@ def test_the_first_view_is_level() -> None:
     np.testing.assert_allclose(-axes[:, 2], ahead, atol=1e-9)
 
 
-def test_known_views_correct_the_boxes() -> None:
+def test_known_views_correct_the_distances() -> None:
     made = replace(model(2, 12, [1]), lengths=(0.05, 0.05, 1.0, 1.0))  # no view is close to another
     missed = np.linspace(-0.5, 0.5, 12)
     read = read_model(sent(made, Seen(np.zeros(12), np.zeros(12), missed)), 7)
@@ -313,11 +275,11 @@ def test_known_views_correct_the_boxes() -> None:
 
 def test_levels_without_a_file_take_the_last_promise_of_what_they_show() -> None:
     made = model(1, 5, [1, 2, 3, 4, 5])
-    told = of_files(made, [2, 4], last=5)  # nothing, A, A, B, B
+    told = of_levels(made, levels_of([[2, 4]], 5))  # nothing, A, A, B, B
     assert told.levels == (1, 2)
     np.testing.assert_array_equal(told.weights, made.weights[:, [2, 4]])
     assert [c.params for c in told.curves] == [made.curves[2].params, made.curves[4].params]
-    assert of_files(model(1, 5, [1]), [2, 4], last=5).curves == ()
+    assert of_levels(model(1, 5, [4]), [2, 3]).curves == ()
 
 
 @given(st.floats(-1e12, 1e12), st.integers(2, 15))
@@ -341,32 +303,27 @@ def viewer(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def contents(tmp_path: Path) -> Contents:
-    """Three categories of three levels, one of them with models."""
-    chunks = write_increments(tmp_path / "chunks", G, SIZES, NAMES, label_of={i: i for i in SIZES})
+    """Three categories of four cells in three levels, one of them with models."""
+    chunks = write_increments(tmp_path / "chunks", G, SIZES, NAMES, label_of=LABEL_OF)
     made = replace(model(3, 6, [1, 2, 3]), label_id=3)
-    fidelity = replace(model(4, 5, [1, 2, 3], quality="fidelity"), label_id=3)
+    cells, drawn = describe_cells(G, LABEL_OF), drawn_cameras(4, 9)
     entries = [
         CameraEntry(f"{i}.jpg", "calibration" if heldout else "train", at)
         for i, (at, heldout) in enumerate(zip(cameras_at(made), made.heldout_inputs, strict=True))
     ]
     entries.append(CameraEntry("none.jpg", "test", camera()))
-    drawn = cameras_at(fidelity)
-    seen: dict[QualityKind, Seen] = {"fidelity": seen_by(drawn, 0.5), "ssim": seen_by(entries, 0.25)}
-    car = Category(3, "car", "car", "#112233", UNIT, 2.0, True, {"fidelity": fidelity, "ssim": made}, seen)
-    points = np.random.default_rng(0).normal(size=(50, 3))
+    seen = Seen(np.full(len(entries), 0.25), np.full(len(entries), 2.0))
+    fidelity = fidelity_models(cells, drawn, 3, 4)[3]
     categories = [
-        Category(-1, "unlabelled", "everything else", "#808080", boxes.split_boxes(points)),
-        replace(car, boxes=boxes.split_boxes(points)),
-        Category(184, "tree", "tree", "#445566", boxes.split_boxes(points[:3])),
+        Category(-1, "unlabelled", "everything else", "#808080"),
+        Category(3, "car", "car", "#112233", 2.0, True, fidelity, made, seen),
+        Category(184, "tree", "tree", "#445566"),
     ]
+    points = np.random.default_rng(0).normal(size=(50, 3))
     return Contents(
-        "tiny", made.extent, entries, categories, chunks, tmp_path / "chunks", 1, points=points,
+        "tiny", made.extent, entries, categories, cells, chunks, tmp_path / "chunks", 1, points=points,
         drawn=drawn,
     )  # fmt: skip
-
-
-def seen_by(viewpoints: Sequence[Any], share: float) -> Seen:
-    return Seen(np.full(len(viewpoints), share), np.full(len(viewpoints), 2.0))
 
 
 def manifest_of(folder: Path) -> dict[str, Any]:
@@ -386,12 +343,18 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
     written = write_bundle(out, contents, viewer)
     manifest = manifest_of(out)
     assert [label["id"] for label in manifest["labels"]] == [-1, 3, 184]
-    assert [[level["count"] for level in label["levels"]] for label in manifest["labels"]] == [
-        [4, 6], [3, 3, 14], [5, 4],
+    cells = [cell for label in manifest["labels"] for cell in label["cells"]]
+    assert [cell["id"] for cell in cells] == [0, 1, 2, 3]
+    assert [[level["count"] for level in cell["levels"]] for cell in cells] == [
+        [4, 6], [3, 3, 6], [2, 3, 3], [5, 4],
     ]  # fmt: skip
     total = 0
-    for label in manifest["labels"]:
-        for level in label["levels"]:
+    for cell in cells:
+        points, bounds = np.array(cell["points"]).reshape(-1, 4), np.array(cell["bounds"])
+        there = bounds[:3] + points[:, :3] / 255 * (bounds[3:] - bounds[:3])
+        known = contents.cells.points()[cell["id"], : len(there)] * FLIP
+        np.testing.assert_allclose(there, known, atol=1e-4)
+        for level in cell["levels"]:
             content = (out / level["uri"]).read_bytes()
             assert len(content) == level["bytes"]
             assert hashlib.sha256(content).hexdigest() == level["sha256"]
@@ -400,8 +363,8 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
     assert manifest["totals"]["bytes"] == written.chunks == total
     assert manifest["totals"]["count"] == 39
     order = packed_parts(out)
-    assert sorted(order) == [[0, 1], [0, 2], [1, 1], [1, 2], [1, 3], [2, 1], [2, 2]]
-    assert sorted(order[:3]) == [[0, 1], [1, 1], [2, 1]]  # the smallest of everything
+    assert sorted(order) == [[cell["id"], k + 1] for cell in cells for k in range(len(cell["levels"]))]
+    assert sorted(order[:4]) == [[cell, 1] for cell in range(4)]  # the smallest of everything
     assert written.manifest == (out / "manifest.json").stat().st_size
     assert written.total == sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
     ours = {"manifest.json", "manifest.schema.json", manifest["pack"]["uri"], "chunks", "LICENSES.txt"}
@@ -416,14 +379,14 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
         assert "://" not in (out / name).read_text()
 
 
-@pytest.mark.parametrize(("quality", "share"), [("fidelity", 0.5), ("ssim", 0.25)])
-def test_promises_know_the_model_s_views_and_shares(contents, quality, share) -> None:
-    promises = json.loads(documents(contents)[1][quality])
-    made, (entry,) = contents.categories[1].models[quality], promises["labels"]
+def test_promises_know_the_model_s_views_and_shares(contents) -> None:
+    promises, made = json.loads(documents(contents)[1]["ssim"]), contents.categories[1].ssim
+    (entry,) = promises["labels"]
+    (whole,) = entry["cells"]
     views = np.cumsum(promises["views"], 1).T / 1e4
     assert (promises["focal"], promises["screens"]) == (made.focal, list(made.screens))
     assert len(views) == made.num_views  # the test photo taught nothing
-    assert np.cumsum(entry["shares"]).tolist() == [share * 1e4] * len(views)
+    assert np.cumsum(whole["shares"]).tolist() == [2500] * len(views)
     inputs = read_model(promises, 3).inputs[:, :7].round(3)
     wanted = sorted(map(tuple, made.inputs[:, :7].round(3).tolist()))
     np.testing.assert_allclose(sorted(map(tuple, inputs.tolist())), wanted, atol=2e-3)
@@ -444,8 +407,9 @@ def packed_parts(out: Path) -> list[list[int]]:
     manifest = manifest_of(out)
     pack, at = manifest["pack"], 0
     content = (out / pack["uri"]).read_bytes()
-    for index, level in pack["order"]:
-        entry = manifest["labels"][index]["levels"][level - 1]
+    levels = {cell["id"]: cell["levels"] for label in manifest["labels"] for cell in label["cells"]}
+    for cell, level in pack["order"]:
+        entry = levels[cell][level - 1]
         part = content[at : at + entry["bytes"]]
         assert hashlib.sha256(part).hexdigest() == entry["sha256"]
         at += len(part)
@@ -470,29 +434,29 @@ def test_the_page_names_the_pack(tmp_path, contents, viewer) -> None:
 
 def test_levels_that_replace_are_in_the_manifest(tmp_path, contents, viewer) -> None:
     chunks = write_increments(
-        tmp_path / "chunks", G, SIZES, NAMES, label_of={i: i for i in SIZES}, replaces={3: (3,)},
-        kind=lambda label, level: "ply" if label == 3 and level == 3 else "spz",
+        tmp_path / "chunks", G, SIZES, NAMES, label_of=LABEL_OF, replaces={1: (3,)},
+        kind=lambda cell, level: "ply" if cell == 1 and level == 3 else "spz",
     )  # fmt: skip
     written = write_bundle(tmp_path / "out", replace(contents, chunks=chunks), viewer)
     manifest = manifest_of(tmp_path / "out")
-    (label,) = (label for label in manifest["labels"] if label["id"] == 3)
-    assert [level.get("refine") for level in label["levels"]] == [None, None, "REPLACE"]
-    assert [level["format"] for level in label["levels"]] == ["spz", "spz", "ply"]
-    others = [level for one in manifest["labels"] if one["id"] != 3 for level in one["levels"]]
+    cells = [cell for label in manifest["labels"] for cell in label["cells"]]
+    assert [level.get("refine") for level in cells[1]["levels"]] == [None, None, "REPLACE"]
+    assert [level["format"] for level in cells[1]["levels"]] == ["spz", "spz", "ply"]
+    others = [level for cell in cells if cell["id"] != 1 for level in cell["levels"]]
     assert {"refine"} & {key for level in others for key in level} == set()
     assert manifest["totals"]["count"] == 39 - 6  # of the full scene
     assert written.chunks == sum(chunk.nbytes for chunk in chunks) > manifest["totals"]["bytes"]
     assert manifest["pack"]["bytes"] == written.chunks
-    assert len(read_ply(tmp_path / "out" / label["levels"][2]["uri"])) == label["levels"][2]["count"] == 14
+    assert len(read_ply(tmp_path / "out" / cells[1]["levels"][2]["uri"])) == 6
 
 
 def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewer) -> None:
     g = replace(random_gaussians(39, degree=1, logit=3), label_ids=G.label_ids)
     second = SecondOpacities(g.logit_opacities - 1, dict.fromkeys(SIZES, (0.0, 0.5, 1.0)))
-    made = write_streams(tmp_path / "chunks", g, SIZES, NAMES, label_of={i: i for i in SIZES}, second=second)
+    made = write_streams(tmp_path / "chunks", g, SIZES, NAMES, label_of=LABEL_OF, second=second)
     written = write_bundle(tmp_path / "out", replace(contents, chunks=made.increments), viewer)
     manifest = manifest_of(tmp_path / "out")
-    listed = [level for label in manifest["labels"] for level in label["levels"]]
+    listed = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
     assert [level["offset"] for level in listed] == [one.offset for one in made.increments]
     assert [level["weight"] for level in listed] == [round(one.weight or 0, 6) for one in made.increments]
     assert {level["format"] for level in listed} == {"stream"}
@@ -501,43 +465,33 @@ def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewe
     assert written.chunks == manifest["totals"]["bytes"]
 
 
+def order_at_origin(*ladders: Ladder, behind: Sequence[int] = ()) -> list[tuple[int, int]]:
+    """Of the view along z from the origin, of cells without models; `behind`: those out of sight."""
+    C = len(ladders)
+    grid = np.tile(np.array([128, 128, 128, 255], np.uint8), (C, POINTS, 1))
+    bounds = np.tile([-1.0, -1, 4, 1, 1, 6], (C, 1))
+    bounds[list(behind), 2], bounds[list(behind), 5] = -6, -4
+    cells = Cells(np.arange(C), np.arange(C), bounds, grid, np.full(C, 0.5), np.full(C, 0.1))
+    return order_of(ladders, cells, {}, pinhole(), 0.95)
+
+
 def test_in_the_pack_what_the_first_view_skips_comes_last() -> None:
-    made = replace(model(2, 6, [1, 2, 3, 4]), weights=np.zeros((6, 4)))
-    here = [0, 0, 0, 0, 0, 1.0, 0, math.log(5)]  # where it is looked from
-    made = replace(made, inputs=np.tile(here, (6, 1)))
-    flat = replace(made.curves[0], params=replace(made.curves[0].params, g1=0, g2=0))
-    means = (0.3, 0.62, 0.9, 0.95)
-    curves = tuple(
-        replace(flat, level=k, params=replace(flat.params, K1=mean, K2=mean))
-        for k, mean in enumerate(means, 1)
-    )
-    one = Ladder([10, 20, 100, 50], 1.0, FRONT, replace(made, curves=curves), np.full(1, 0.1), [3])
-    assert order_at_origin(one) == [(0, 1), (0, 3), (0, 4), (0, 2)]  # nothing reaches 1
-    assert order_at_origin(replace(one, target=0.8)) == [(0, 1), (0, 3), (0, 4), (0, 2)]
-    assert order_at_origin(replace(one, target=0.5)) == [(0, 1), (0, 2), (0, 3), (0, 4)]
-    assert order_at_origin(replace(one, model=None)) == [(0, 1), (0, 3), (0, 4), (0, 2)]
-    plain = Ladder([10, 20, 100, 50], 1.0, FRONT, None, None)
-    order = order_at_origin(plain, replace(one, replaces=[2, 3]))
+    one = Ladder([10, 20, 100, 50], 1.0, [3])  # unknown: wanted in full
+    assert order_at_origin(one) == [(0, 1), (0, 3), (0, 4), (0, 2)]
+    order = order_at_origin(replace(one, replaces=()), replace(one, replaces=[2, 3]))
     assert order[-1] == (1, 2)
     assert sorted(order) == [(i, k) for i in (0, 1) for k in (1, 2, 3, 4)]
-
-
-FRONT = np.array([[-1.0, -1, -6, 1, 1, -4]])
-
-
-def order_at_origin(*ladders: Ladder) -> list[tuple[int, int]]:
-    """Of the view along -z from the origin."""
-    return order_of(ladders, [camera()], np.zeros(3), np.array([0.0, 0, 0, 1]))
+    assert costs_of([one, Ladder([5])]).tolist() == [[10, 30, 100, 150], [5, 5, 5, 5]]
 
 
 def test_what_gains_more_a_byte_comes_first_in_the_pack() -> None:
-    one = Ladder([10, 100, 100], 1.0, FRONT, None, None)
+    one = Ladder([10, 100, 100])
     heavy, dear = replace(one, weight=50.0), replace(one, sizes=[10, 1000, 1000])
     assert order_at_origin(one, heavy) == [(1, 1), (0, 1), (1, 2), (1, 3), (0, 2), (0, 3)]
     assert order_at_origin(dear, one)[2:] == [(1, 2), (1, 3), (0, 2), (0, 3)]
-    equals = [(0, 1), (1, 1), (0, 2), (1, 2), (0, 3), (1, 3)]
-    assert order_at_origin(one, one) == equals
+    assert order_at_origin(one, one) == [(0, 1), (1, 1), (0, 2), (1, 2), (0, 3), (1, 3)]
     assert order_at_origin(replace(one, weight=0.0)) == [(0, 1), (0, 2), (0, 3)]
+    assert order_at_origin(one, one, behind=[0]) == [(1, 1), (0, 1), (1, 2), (1, 3), (0, 2), (0, 3)]
     assert order_at_origin() == []
 
 
@@ -578,7 +532,9 @@ def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, content
 
 
 def test_without_points_or_labels() -> None:
-    empty = Contents("none", 0.0, [CameraEntry("a", "test", camera())], [], [], Path("none"), 0)
+    entry = CameraEntry("a", "test", camera())
+    cells = Cells(**{name: array[:0] for name, array in vars(describe_cells(G, LABEL_OF)).items()})
+    empty = Contents("none", 0.0, [entry], [], cells, [], Path("none"), 0)
     manifest, promises = documents(empty)
     assert promises == manifest["promises"] == {}
     assert manifest["pack"] is None

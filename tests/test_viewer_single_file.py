@@ -10,6 +10,7 @@ import pytest
 import torch
 from conftest import pinhole, random_gaussians
 
+from sagesplat.adapt.cells import describe_cells
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.formats.increments import write_increments
 from sagesplat.viewer import single_file
@@ -51,13 +52,11 @@ def contents(tmp_path: Path) -> Contents:
     g = random_gaussians(30, degree=1).select(torch.arange(30))
     sizes = {label: (2, n) for label, n in g.counts().items()}
     chunks = write_increments(
-        tmp_path / "chunks", g, sizes, {3: "car", 184: "tree"}, label_of={3: 3, 184: 184}
+        tmp_path / "chunks", g, sizes, {3: "car", 184: "tree"}, label_of={i: i for i in sizes}
     )
-    unit = torch.tensor([[-1.0, -1, -1, 1, 1, 1]]).numpy()
-    categories = [Category(i, f"c{i}", f"c{i}", "#808080", unit) for i in sizes]
-    return Contents(
-        "tiny", 1.0, [CameraEntry("a.jpg", "train", pinhole())], categories, chunks, tmp_path / "chunks", 1
-    )
+    categories = [Category(i, f"c{i}", f"c{i}", "#808080") for i in sizes]
+    cells, cameras = describe_cells(g, {i: i for i in sizes}), [CameraEntry("a.jpg", "train", pinhole())]
+    return Contents("tiny", 1.0, cameras, categories, cells, chunks, tmp_path / "chunks", 1)
 
 
 def test_everything_is_in_the_page(tmp_path, viewer, contents) -> None:
@@ -73,7 +72,7 @@ def test_everything_is_in_the_page(tmp_path, viewer, contents) -> None:
     manifest = json.loads(files.pop("manifest.json"))
     assert manifest["pack"] is None
     assert (files.pop("THIRD_PARTY_LICENSES.txt"), b"Apache" in files.pop("LICENSES.txt")) == (b"MIT", True)
-    levels = [level for label in manifest["labels"] for level in label["levels"]]
+    levels = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
     assert [hashlib.sha256(files[level["uri"]]).hexdigest() for level in levels] == [
         level["sha256"] for level in levels
     ]

@@ -12,7 +12,7 @@ point over the planes of the frustum:
 (`web/src/core/distance.ts`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,8 @@ from sagesplat.scene.scene import Camera
 
 POINTS = 16  # of a cell
 STEPS = 255  # of positions within the bounds, and of areas
-PERCENTILE = 0.25
+PERCENTILE = 0.25  # of a cell's distances
+LABEL_PERCENTILE = 0.05  # of those of a category as a whole
 _AROUND = 0.9  # share of a cell's Gaussians within its radius around the points
 _SAMPLE = 2000  # Gaussians of a cell that its points are found from
 
@@ -105,10 +106,32 @@ def _described(
 
 def look(cells: Cells, cameras: Sequence[Camera]) -> Sight:
     """How V cameras see the cells (formulas: the module's text)."""
-    points, areas = cells.points(), cells.areas()
     shape = len(cameras), len(cells.ids)
     apparent, distance = np.zeros(shape), np.full(shape, np.nan)
-    for row, camera in enumerate(cameras):
+    for row, (camera, (away, weight)) in enumerate(zip(cameras, _seen(cells, cameras), strict=True)):
+        solid, K = (weight / away**2).sum(1), camera.K.astype(np.float64)
+        apparent[row] = solid * K[0, 0] * K[1, 1] / (camera.width * camera.height)
+        distance[row] = _percentile(away, weight, PERCENTILE)
+    return Sight(apparent, distance)
+
+
+def label_distances(cells: Cells, cameras: Sequence[Camera]) -> Float[np.ndarray, "V L"]:
+    """Distance of each label as a whole: a low percentile over the points of its cells; NaN: out of sight."""
+    labels = np.unique(cells.labels)
+    found = np.full((len(cameras), len(labels)), np.nan)
+    for row, (away, weight) in enumerate(_seen(cells, cameras)):
+        for column, label in enumerate(labels):
+            mine = cells.labels == label
+            found[row, column] = _percentile(
+                away[mine].reshape(1, -1), weight[mine].reshape(1, -1), LABEL_PERCENTILE
+            )[0]
+    return found
+
+
+def _seen(cells: Cells, cameras: Sequence[Camera]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For each camera the points' distances and their areas in sight, both [C, P]."""
+    points, areas = cells.points(), cells.areas()
+    for camera in cameras:
         R, t = camera.w2c[:3, :3].astype(np.float64), camera.w2c[:3, 3].astype(np.float64)
         x, y, z = np.moveaxis(points @ R.T + t, -1, 0)
         K, size = camera.K.astype(np.float64), (camera.width, camera.height)
@@ -119,15 +142,18 @@ def look(cells: Cells, cameras: Sequence[Camera]) -> Sight:
             height = np.minimum(height, (along - low * z) / np.hypot(1, low))
             height = np.minimum(height, (high * z - along) / np.hypot(1, high))
         inside = np.clip(0.5 + height / (2 * np.maximum(cells.radius, 1e-9)[:, None]), 0, 1)
-        away, weight = np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-9), areas * inside
-        solid = (weight / away**2).sum(1)
-        apparent[row] = solid * K[0, 0] * K[1, 1] / (camera.width * camera.height)
-        order = np.argsort(away, 1, kind="stable")
-        running = np.cumsum(np.take_along_axis(weight, order, 1), 1)
-        first = (running >= PERCENTILE * running[:, -1:]).argmax(1)
-        near = np.take_along_axis(away, order, 1)[np.arange(len(order)), first]
-        distance[row] = np.where(solid > 0, near, np.nan)
-    return Sight(apparent, distance)
+        yield np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-9), areas * inside
+
+
+def _percentile(
+    away: Float[np.ndarray, "C P"], weight: Float[np.ndarray, "C P"], part: float
+) -> Float[np.ndarray, " C"]:
+    """The first distance up to which there is this part of the weights; NaN without any."""
+    order = np.argsort(away, 1, kind="stable")
+    running: np.ndarray = np.cumsum(np.take_along_axis(weight, order, 1), 1)
+    first = (running >= part * running[:, -1:]).argmax(1)
+    near = np.take_along_axis(away, order, 1)[np.arange(len(order)), first]
+    return np.where(running[:, -1] > 0, near, np.nan)
 
 
 def write_cells(path: Path, cells: Cells) -> None:

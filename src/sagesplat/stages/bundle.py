@@ -12,7 +12,6 @@ import torch
 from PIL import Image
 
 from sagesplat.adapt.observe import large_enough
-from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
 from sagesplat.core.gaussians import Gaussians
@@ -34,13 +33,12 @@ from sagesplat.stages.results import (
     increments_of,
     observations_of,
     promises_of,
-    sampled_of,
     viewpoints_of,
 )
 from sagesplat.stages.shared import category_and_block
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.bundle import BundleSizes, check_target, write_bundle
-from sagesplat.viewer.corrections import distance_error, with_corrections
+from sagesplat.viewer.corrections import with_corrections
 from sagesplat.viewer.frames import camera_at
 from sagesplat.viewer.manifest import Category, Contents, start_of
 from sagesplat.viewer.pack import ASPECT, FOV_Y
@@ -52,15 +50,13 @@ _POSTER_HEIGHT = 360  # px
 
 @dataclass(frozen=True)
 class BundleMade:
-    """The content of a bundle, and the accuracy of the distances by its boxes."""
+    """The content of a bundle."""
 
     path: Path
     labels: int
     chunks: int  # increments
     count: int  # Gaussians
     sizes: BundleSizes  # bytes
-    agreement: dict[int, tuple[float, float]]  # by label id: median, 95th percentile of the relative error
-    error: tuple[float, float]  # the same over all labels
 
 
 def bundle(
@@ -108,7 +104,7 @@ def bundle(
     full = full_scene(listed)
     g, drawn = read_increments(job.run.increments, full), viewpoints_of(job)
     contents = replace(
-        bundle_contents(job, g, job.antialiased),
+        bundle_contents(job, g, job.cells, job.antialiased),
         chunks=listed,
         meters_per_unit=meters_per_unit,
         drawn=[drawn.cameras[row] for row in drawn.rows("fit")],
@@ -123,9 +119,8 @@ def bundle(
         if chunks == "spz" and _in_streams(listed):
             contents = _in_spz(job, contents, Path(work) / "increments")
         written = write(out, contents, viewer, _poster(g, contents))
-    agreement, error = distance_error(contents)
     count = sum(chunk.count for chunk in full)
-    return BundleMade(out, len(contents.categories), len(listed), count, written, agreement, error)
+    return BundleMade(out, len(contents.categories), len(listed), count, written)
 
 
 def _in_spz(job: Job, contents: Contents, folder: Path) -> Contents:
@@ -142,7 +137,9 @@ def _in_spz(job: Job, contents: Contents, folder: Path) -> Contents:
             "than in coded streams, and the bundle has no bounds of them"
         )
     )
-    return replace(made, categories=[replace(one, models={}, seen={}) for one in contents.categories])
+    return replace(
+        made, categories=[replace(one, fidelity=None, ssim=None, seen=None) for one in contents.categories]
+    )
 
 
 def _in_streams(listed: Sequence[Increment]) -> bool:
@@ -207,21 +204,22 @@ def _check_asked(
 def _with_quality(
     job: Job, categories: Sequence[Category], always: Collection[str], weights: Mapping[str, float]
 ) -> list[Category]:
-    models: dict[QualityKind, dict[int, ViewModel]] = {"fidelity": fidelity_of(job), "ssim": promises_of(job)}
-    seen: dict[QualityKind, dict[int, Seen]] = {
-        "fidelity": _seen_from_drawn(job),
-        "ssim": _seen_in_photos(job) if has_photos(job.run) else {},
-    }
-    return [
-        replace(
-            category,
-            weight=float(weights.get(category.name, weights.get(category.category, 1.0))),
-            always=category.name in always or category.category in always,
-            models={q: some[category.label_id] for q, some in models.items() if category.label_id in some},
-            seen={q: some[category.label_id] for q, some in seen.items() if category.label_id in some},
+    fidelity, ssim = fidelity_of(job), promises_of(job)
+    seen = _seen_in_photos(job) if has_photos(job.run) else {}
+    found = []
+    for category in categories:
+        label, whole = category.label_id, category_and_block(job, category.name)[0]
+        found.append(
+            replace(
+                category,
+                weight=float(weights.get(category.name, weights.get(whole, 1.0))),
+                always=category.name in always or whole in always,
+                fidelity=fidelity.get(label),
+                ssim=ssim.get(label),
+                seen=seen.get(label),
+            )
         )
-        for category in categories
-    ]
+    return found
 
 
 def _seen_in_photos(job: Job) -> dict[int, Seen]:
@@ -229,16 +227,6 @@ def _seen_in_photos(job: Job) -> dict[int, Seen]:
     shares, far = _shares(job), job.distances(job.fit_config.distance)
     nowhere, unknown = np.zeros(len(job.scene.views)), np.full(len(job.scene.views), np.nan)
     return {label: Seen(shares.get(label, nowhere), far.get(label, unknown)) for label in {*shares, *far}}
-
-
-def _seen_from_drawn(job: Job) -> dict[int, Seen]:
-    """The same of the viewpoints at which fidelity was sampled."""
-    sampled = sampled_of(job)
-    shares = np.where(sampled.shown(), sampled.pixels / sampled.image[:, None], 0.0)
-    return {
-        label: Seen(shares[:, column], sampled.distance[:, column].astype(np.float64))
-        for column, label in enumerate(sampled.labels)
-    }
 
 
 def _shares(job: Job) -> dict[int, np.ndarray]:

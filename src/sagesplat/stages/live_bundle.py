@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from sagesplat.adapt.cells import describe_cells
 from sagesplat.core.errors import RunError
 from sagesplat.formats.increments import write_increments
 from sagesplat.formats.levels import read_level
@@ -26,9 +27,9 @@ _LIVE = ".live.json"  # the level that a live bundle was made from, and its file
 def live_bundle(job: Job, folder: Path, viewer: Path | None = None) -> bool:
     """Write the newest level of a training, which may still run, to `folder`; False if it is there already.
 
-    The bundle has one level per category and no bounds. Files are written atomically. Those that a page may
-    still be loading are kept until two newer levels are written. RunError if there is no level yet, or where
-    another process writes there for seconds.
+    In the bundle a category is one cell with one level; there are no bounds. Files are written atomically.
+    Those that a page may still be loading are kept until two newer levels are written. RunError if there is
+    no level yet, or where another process writes there for seconds.
     """
     job = replace(job, run=replace(job.run, ladder="snapshots"))  # what training writes knows no instances
     with alone(folder, _OTHERS):
@@ -52,16 +53,19 @@ def _live_bundle(job: Job, folder: Path, viewer: Path) -> bool:
         write_text(folder / PAGE, (viewer / PAGE).read_text(encoding="utf-8"))
     g = read_level(steps[-1])
     g = g.select(torch.argsort(g.label_ids, stable=True))
+    labels, cell_ids = torch.unique(g.label_ids, return_inverse=True)
+    label_of = dict(enumerate(labels.tolist()))  # every category is one cell
+    g = replace(g, label_ids=cell_ids.to(g.label_ids.dtype))
     antialiased = trains_antialiased(job)
     work, target = folder / ".chunks", folder / "chunks"
-    sizes = {label: (n,) for label, n in g.counts().items()}
-    label_of = {label: label for label in sizes}
+    sizes = {cell: (n,) for cell, n in g.counts().items()}
     chunks = write_increments(work, g, sizes, job.names(), label_of=label_of, antialiased=antialiased)
     target.mkdir(exist_ok=True)
     for chunk in chunks:
         (work / chunk.uri).replace(target / chunk.uri)
     shutil.rmtree(work)
-    write_documents(folder, replace(bundle_contents(job, g, antialiased), chunks=chunks, live=True))
+    contents = bundle_contents(job, g, describe_cells(g, label_of), antialiased)
+    write_documents(folder, replace(contents, chunks=chunks, live=True))
     uris = [chunk.uri for chunk in chunks]
     kept = [uris, *(version for version in (previous.kept if previous else ()) if version != uris)][:3]
     write_json(folder / _LIVE, {"of": newest, "kept": kept})

@@ -8,6 +8,7 @@ generated. All are deterministic: they contain no times.
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,16 +16,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sagesplat import __version__
-from sagesplat.adapt.observe import widest_lens
+from sagesplat.adapt.cell_models import FidelityModel
+from sagesplat.adapt.cells import STEPS, Cells
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.formats.increments import Increment, full_scene
 from sagesplat.scene.scene import Camera
-from sagesplat.segment.block_categories import split_name
 from sagesplat.viewer import frames
 from sagesplat.viewer.frames import FLIP
-from sagesplat.viewer.pack import Ladder, order_of
-from sagesplat.viewer.promises import Seen, promises_document
-from sagesplat.viewer.quality import decimals_of, dumped, of_files, quality_entry, significant
+from sagesplat.viewer.pack import ASPECT, FOV_Y, HEIGHT, Ladder, costs_of, order_of
+from sagesplat.viewer.promises import Seen, fidelity_document, of_cells, ssim_document
+from sagesplat.viewer.quality import (
+    decimals_of,
+    dumped,
+    fidelity_entries,
+    levels_of,
+    of_levels,
+    quality_entry,
+    significant,
+)
 
 FORMAT, VERSION = "sagesplat-bundle", 1
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)
@@ -49,29 +58,24 @@ class Category:
     name: str  # in the taxonomy; CATEGORY@BLOCK in a scene in blocks
     title: str  # display name
     color: str  # #rrggbb
-    boxes: Float[np.ndarray, "B 6"]  # in the bundle's axes
     weight: float = 1.0
     always: bool = False  # shipped in full whatever the plan says
-    models: Mapping[QualityKind, ViewModel] = field(default_factory=dict)  # with the ladder's levels
-    seen: Mapping[QualityKind, Seen] = field(default_factory=dict)  # in the quality's viewpoints
-    block: int | None = None  # in a scene in blocks; else None
+    fidelity: FidelityModel | None = None  # with the ladder's levels
+    ssim: ViewModel | None = None  # against photos, with the ladder's levels
+    seen: Seen | None = None  # in the photos
     parent: str | None = None  # of an instance: its category
-
-    @property
-    def category(self) -> str:
-        """The category's name without the block."""
-        return self.name if self.block is None else split_name(self.name)[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """The contents of a bundle; cameras and points in COLMAP's axes, boxes in the bundle's."""
+    """The contents of a bundle; cameras, points and cells in COLMAP's axes."""
 
     name: str
     extent: float  # Scene.extent, world units
     cameras: Sequence[CameraEntry]  # at least one
     categories: Sequence[Category]
-    chunks: Sequence[Increment]  # of these categories: the files in chunks/
+    cells: Cells  # of these categories
+    chunks: Sequence[Increment]  # of these cells: the files in chunks/
     folder: Path  # of the increments
     sh_degree: int
     antialiased: bool = False
@@ -84,28 +88,75 @@ class Contents:
     ladder: str | None = None  # `formats.label_edits.ladder_hash`; None: labels cannot be edited
     hidden: Collection[str] = ()  # names of categories that are not shown to begin with
 
-    def viewpoints(self, quality: QualityKind) -> list[Camera]:
-        """The viewpoints that the models of a quality were fitted at, and maybe others."""
-        return list(self.drawn) if quality == "fidelity" else [entry.camera for entry in self.cameras]
-
     @property
     def qualities(self) -> list[QualityKind]:
         """The qualities that some category has a model of, the one to show by default first."""
-        return [q for q in QUALITIES if any(q in c.models for c in self.categories) and self.viewpoints(q)]
+        there = {
+            "fidelity": bool(self.drawn) and any(c.fidelity for c in self.categories),
+            "ssim": bool(self.cameras) and any(c.ssim for c in self.categories),
+        }
+        return [quality for quality in QUALITIES if there[quality]]
+
+    @cached_property
+    def files(self) -> dict[int, list[Increment]]:
+        """By cell id, its increments by level; without any there is no such cell."""
+        by_cell: dict[int, list[Increment]] = {}
+        for chunk in sorted(self.chunks, key=lambda c: c.level):
+            by_cell.setdefault(chunk.cell, []).append(chunk)
+        return by_cell
+
+    @cached_property
+    def levels(self) -> dict[int, list[int]]:
+        """By cell id, the nested levels of its files."""
+        return {cell: [chunk.level for chunk in chunks] for cell, chunks in self.files.items()}
+
+    @property
+    def last(self) -> int:
+        """The last of the nested levels."""
+        return max((chunk.level for chunk in self.chunks), default=0)
+
+    @cached_property
+    def shown(self) -> Cells:
+        """The cells that have files."""
+        kept = np.isin(self.cells.ids, list(self.files))
+        return Cells(**{name: array[kept] for name, array in vars(self.cells).items()})
+
+    @cached_property
+    def models(self) -> dict[int, FidelityModel]:
+        """Models of fidelity by label id, with the levels of the files."""
+        models = {c.label_id: c.fidelity for c in self.categories if c.fidelity is not None}
+        return of_cells(models, self.levels, self.last) if models and self.drawn and self.files else {}
+
+    def ladders(self) -> list[Ladder]:
+        """Of each cell that has files."""
+        weights, found = {c.label_id: c.weight for c in self.categories}, []
+        for cell, label in self.shown.label_of.items():
+            chunks = self.files[cell]
+            replaces = [level for level, one in enumerate(chunks, 1) if one.refine == "REPLACE"]
+            found.append(Ladder([one.nbytes for one in chunks], weights.get(label, 1.0), replaces))
+        return found
 
 
 def documents(
     contents: Contents, third_party: bool = False
 ) -> tuple[dict[str, Any], dict[QualityKind, bytes]]:
     """The manifest as plain data, and by quality the bytes of promises-*.json."""
-    by_label = _chunks_by_label(contents.chunks)
-    full = full_scene(contents.chunks)
-    models: dict[QualityKind, dict[int, ViewModel]] = {
-        quality: some for quality in contents.qualities if (some := _models(contents, quality))
-    }
-    promises: dict[QualityKind, bytes] = {
-        quality: _promises(contents, quality, some) for quality, some in models.items()
-    }
+    full, ssim = full_scene(contents.chunks), _ssim_models(contents)
+    entries: dict[QualityKind, dict[int, dict[str, Any]]] = {}
+    promises: dict[QualityKind, bytes] = {}
+    if models := contents.models:
+        cost = costs_of(contents.ladders())
+        around = [*contents.drawn, *(entry.camera for entry in contents.cameras)]
+        given = {c.label_id: c.fidelity for c in contents.categories if c.label_id in models and c.fidelity}
+        document = fidelity_document(given, contents.levels, contents.last, contents.shown, cost, around)
+        promises["fidelity"] = dumped(document)
+        entries["fidelity"] = fidelity_entries(models, contents.shown, contents.drawn, cost.shape[1])
+    if ssim:
+        seen = {c.label_id: c.seen for c in contents.categories if c.seen is not None}
+        photos = [entry.camera for entry in contents.cameras]
+        promises["ssim"] = dumped(ssim_document(ssim, photos, seen))
+        entries["ssim"] = {label: quality_entry(model) for label, model in ssim.items()}
+    cells = _cells(contents)
     manifest = {
         "format": FORMAT,
         "version": VERSION,
@@ -123,9 +174,9 @@ def documents(
         },
         **({} if contents.ladder is None else {"ladder": contents.ladder}),
         "labels": [
-            _label(c, by_label[c.label_id], models, contents.extent, c.name in contents.hidden)
+            _label(c, cells[c.label_id], entries, c.name in contents.hidden)
             for c in contents.categories
-            if by_label.get(c.label_id)
+            if c.label_id in cells
         ],
         "promises": {quality: _reference(content) for quality, content in promises.items()},
         "target": _target(contents),
@@ -137,15 +188,17 @@ def documents(
     return manifest, promises
 
 
-def _models(contents: Contents, quality: QualityKind) -> dict[int, ViewModel]:
-    """By label id, the models of a quality with the levels of the label's files; without any level none."""
-    by_label = _chunks_by_label(contents.chunks)
-    last = max((chunk.level for chunk in contents.chunks), default=0)
-    found = {
-        c.label_id: of_files(c.models[quality], [chunk.level for chunk in by_label[c.label_id]], last)
-        for c in contents.categories
-        if quality in c.models and by_label.get(c.label_id)
-    }
+def _ssim_models(contents: Contents) -> dict[int, ViewModel]:
+    """Models of SSIM by label id, with the levels of the cells' files; without any level none."""
+    found = {}
+    for category in contents.categories:
+        files = [
+            contents.levels[cell]
+            for cell, label in contents.shown.label_of.items()
+            if label == category.label_id
+        ]
+        if category.ssim is not None and files and contents.cameras:
+            found[category.label_id] = of_levels(category.ssim, levels_of(files, contents.last))
     return {label: model for label, model in found.items() if model.curves}
 
 
@@ -159,86 +212,71 @@ def _target(contents: Contents) -> dict[str, Any]:
 
 
 def pack_order(contents: Contents) -> list[tuple[int, int]]:
-    """The order of the files in the pack: (index of the label in the manifest, level).
-
-    By fidelity at the drawn viewpoints where the bundle has it, else by SSIM at the photos.
-    """
-    known = contents.qualities
-    quality: QualityKind = known[0] if known else "ssim"
-    by_label, models = _chunks_by_label(contents.chunks), _models(contents, quality)
+    """The order of the files in the pack: (id of the cell, level)."""
     first, target = start_of(contents), _target(contents)
-    cameras = contents.viewpoints(quality)
-    used = np.ones(len(cameras), bool)
-    if quality == "ssim":
-        used = np.array([entry.split != "test" for entry in contents.cameras])
-    ladders = [
-        Ladder(
-            [chunk.nbytes for chunk in by_label[c.label_id]],
-            c.weight,
-            c.boxes,
-            models.get(c.label_id),
-            c.seen[quality].shares[used] if quality in c.seen else None,
-            [level for level, chunk in enumerate(by_label[c.label_id], 1) if chunk.refine == "REPLACE"],
-            target["value"] if target["quality"] == quality else 1.0,
-        )
-        for c in contents.categories
-        if by_label.get(c.label_id)
-    ]
-    cameras = [camera for camera, use in zip(cameras, used, strict=True) if use]
-    lens = widest_lens([entry.camera for entry in contents.cameras])
-    return order_of(ladders, cameras, first["position"], first["quaternion"], lens)
-
-
-def _promises(contents: Contents, quality: QualityKind, models: Mapping[int, ViewModel]) -> bytes:
-    seen = {c.label_id: c.seen[quality] for c in contents.categories if quality in c.seen}
-    return dumped(promises_document(quality, models, contents.viewpoints(quality), seen))
+    size = round(ASPECT * HEIGHT), HEIGHT
+    camera = frames.camera_at(first["position"], first["quaternion"], FOV_Y, *size)
+    wanted = target["value"] if target["quality"] == "fidelity" else TARGETS["fidelity"]
+    return order_of(contents.ladders(), contents.shown, contents.models, camera, wanted)
 
 
 def _label(
     category: Category,
-    chunks: Sequence[Increment],
-    models: Mapping[QualityKind, Mapping[int, ViewModel]],
-    extent: float,
+    cells: Sequence[dict[str, Any]],
+    entries: Mapping[QualityKind, Mapping[int, dict[str, Any]]],
     hidden: bool,
 ) -> dict[str, Any]:
     return {
         "id": category.label_id,
         "name": category.name,
-        **({} if category.block is None else {"category": category.category, "block": category.block}),
         **({} if category.parent is None else {"parent": category.parent}),
         "title": category.title,
         "color": category.color,
         "weight": significant(category.weight),
         "always": category.always,
         **({"hidden": True} if hidden else {}),
-        "boxes": np.round(category.boxes, decimals_of(extent, 3)).tolist(),
-        "levels": [
-            {
-                "uri": f"chunks/{chunk.uri}",
-                "format": chunk.format,
-                **({"refine": "REPLACE"} if chunk.refine == "REPLACE" else {}),
-                **({"offset": chunk.offset} if chunk.format == "stream" else {}),
-                **({} if chunk.weight is None else {"weight": round(chunk.weight, 6)}),
-                "bytes": chunk.nbytes,
-                "gpuBytes": chunk.gpu_bytes,
-                "count": chunk.count,
-                "sha256": chunk.sha256,
-            }
-            for chunk in chunks
-        ],
+        "cells": cells,
         "quality": {
-            quality: quality_entry(some[category.label_id])
-            for quality, some in models.items()
-            if category.label_id in some
+            quality: some[category.label_id] for quality, some in entries.items() if category.label_id in some
         },
     }
 
 
-def _chunks_by_label(chunks: Sequence[Increment]) -> dict[int, list[Increment]]:
-    by_label: dict[int, list[Increment]] = {}
-    for chunk in sorted(chunks, key=lambda c: c.level):
-        by_label.setdefault(chunk.label_id, []).append(chunk)
-    return by_label
+def _cells(contents: Contents) -> dict[int, list[dict[str, Any]]]:
+    """By label id, the entries of its cells."""
+    found: dict[int, list[dict[str, Any]]] = {}
+    for row, (cell, label) in enumerate(contents.shown.label_of.items()):
+        levels = [_level(chunk) for chunk in contents.files[cell]]
+        found.setdefault(label, []).append({**placed(contents.shown, row), "levels": levels})
+    return found
+
+
+def placed(cells: Cells, row: int) -> dict[str, Any]:
+    """Where a cell is, in the bundle's axes."""
+    bounds, grid = cells.bounds[row].reshape(2, 3) * FLIP, cells.grid[row].astype(int)
+    grid[:, :3] = np.where(FLIP < 0, STEPS - grid[:, :3], grid[:, :3])
+    used = grid[:, 3] > 0
+    return {
+        "id": int(cells.ids[row]),
+        "bounds": significant([*bounds.min(0), *bounds.max(0)]),
+        "points": (grid[used] if used.any() else grid[:1]).ravel().tolist(),
+        "area": significant(cells.area[row]),
+        "radius": significant(cells.radius[row], 4),
+    }
+
+
+def _level(chunk: Increment) -> dict[str, Any]:
+    return {
+        "uri": f"chunks/{chunk.uri}",
+        "format": chunk.format,
+        **({"refine": "REPLACE"} if chunk.refine == "REPLACE" else {}),
+        **({"offset": chunk.offset} if chunk.format == "stream" else {}),
+        **({} if chunk.weight is None else {"weight": round(chunk.weight, 6)}),
+        "bytes": chunk.nbytes,
+        "gpuBytes": chunk.gpu_bytes,
+        "count": chunk.count,
+        "sha256": chunk.sha256,
+    }
 
 
 def _frame(contents: Contents) -> dict[str, Any]:

@@ -1,9 +1,10 @@
 """The pack: all increments of a bundle in one file, for the first load without a round trip per increment.
 
 It is a concatenation of the increments, in the order of their benefit for the first view: level 1 of all
-visible and nearby labels, then increments by their gain of expected quality x pixel share per byte.
-Levels of a label must come in order. So an increment counts with the slope of the concave hull of quality
-over bytes. The viewer has the same rules (web/src/core/order.ts).
+cells, those in sight first; then the upgrades by which categories reach the target; then all others, by gain
+of expected quality x pixel share per byte, those out of sight last. Levels of a cell must come in order, so
+an increment counts with the slope of the concave hull of quality over bytes. The viewer orders by the same
+gains (web/src/core/order.ts).
 
 Where the first view needs a level that replaces those below, the ones between the first and that come last:
 nobody is to download what is thrown away at once.
@@ -11,83 +12,77 @@ nobody is to download what is thrown away at once.
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from sagesplat.adapt.process import matern32
-from sagesplat.adapt.viewpoint import Prediction, ViewModel, where
+from sagesplat.adapt.cell_models import FidelityModel, expect, needed
+from sagesplat.adapt.cell_plans import reach
+from sagesplat.adapt.cells import Cells
 from sagesplat.scene.scene import Camera
-from sagesplat.viewer import boxes
-from sagesplat.viewer.frames import camera_at
 
 # of the first view, as in the viewer on a usual screen
-FOV_Y, ASPECT = math.radians(60), 16 / 9
-_HEIGHT = 1080  # pixels
-_LEAST_SHARE = 1e-4  # least pixel share, so that every visible label counts
-_LEAST = 1e-6  # weight of labels out of sight, and least gain
-NEARBY = 2**18  # bytes of first levels out of sight that precede all finer levels
-_TURN = 0.25  # assumed probability that the viewer soon turns to a label out of sight
+FOV_Y, ASPECT, HEIGHT = math.radians(60), 16 / 9, 1080
+_LEAST_SHARE = 1e-4  # least pixel share, so that every cell in sight counts
+_LEAST = 1e-6  # least gain
 
 
 @dataclass(frozen=True, eq=False)
 class Ladder:
-    """The data of a label that decides where its files are placed."""
+    """The data of a cell that decides where its files are placed."""
 
     sizes: Sequence[int]  # bytes of its files, by level
-    weight: float
-    boxes: Float[np.ndarray, "B 6"]  # in the bundle's axes
-    model: ViewModel | None  # with the files' levels; None: no quality model
-    shares: Float[np.ndarray, " V"] | None  # share of each camera's pixels
+    weight: float = 1.0  # of its label
     replaces: Sequence[int] = field(default_factory=list)  # levels that replace those below, ascending
-    target: float = 1.0  # quality that a viewer begins with
+
+
+def costs_of(ladders: Sequence[Ladder]) -> Int[np.ndarray, "C K"]:
+    """Bytes of the cells' levels, as far as any has them; above a cell's last level that of the last one."""
+    table = np.zeros((len(ladders), max((len(one.sizes) for one in ladders), default=0)), np.int64)
+    for row, one in enumerate(ladders):
+        total = 0
+        for k, size in enumerate(one.sizes):
+            total = size + (0 if k + 1 in one.replaces else total)
+            table[row, k:] = total
+    return table
 
 
 def order_of(
     ladders: Sequence[Ladder],
-    cameras: Sequence[Camera],
-    position: Float[np.ndarray, "3"],
-    quaternion: Float[np.ndarray, "4"],
-    lens: tuple[float, float] = (math.inf, math.inf),
+    cells: Cells,
+    models: Mapping[int, FidelityModel],
+    camera: Camera,
+    target: float,
 ) -> list[tuple[int, int]]:
-    """(index of the ladder, level) of all files, ordered for the view from a pose in the bundle's axes.
+    """(cell id, level) of all files, ordered for the view of a camera.
 
-    `lens`: of the photos (`adapt.observe.widest_lens`).
+    `ladders`: of the cells, in their order. `models`: of fidelity, with the files' levels. `target`: that a
+    viewer begins with.
     """
-    planes = boxes.frustum(position, quaternion, FOV_Y, ASPECT)
-    photo = boxes.photo_frustum(position, quaternion, FOV_Y, ASPECT, lens)
-    camera = camera_at(position, quaternion, FOV_Y, round(ASPECT * _HEIGHT), _HEIGHT)
-    ranked, behind = [], []
-    for index, ladder in enumerate(ladders):
-        visible = not len(ladder.boxes) or boxes.touching(ladder.boxes, planes).any()
-        weight = ladder.weight * max(_share(ladder, cameras, camera, position, planes), _LEAST_SHARE)
-        weight = max(weight * (1 if visible else _LEAST), _LEAST**2)
-        distance = boxes.distance(ladder.boxes, position, planes, photo)
-        path, skipped = _path(ladder, camera, distance)
+    cost = costs_of(ladders)
+    if not len(ladders):
+        return []
+    expected = expect(models, cells, [camera], cost.shape[1])
+    mean, share = expected.mean[0], expected.share[0]
+    wanted = reach(cost, mean, share, expected.column, needed(models, expected, target)[0]).levels + 1
+    ranked = []
+    for row, (cell, ladder) in enumerate(zip(cells.ids.tolist(), ladders, strict=True)):
+        visible, last = bool(share[row] > 0), len(ladder.sizes)
+        path, skipped = _path(ladder, min(int(wanted[row]), last))
         total = np.cumsum(np.take(ladder.sizes, path - 1), dtype=np.float64)
-        ssim, limit = _expected(ladder, camera, distance, path, total), math.inf
-        if visible:
-            ranked.append((0, -weight / total[0], index, 1))
-        else:
-            around = ladder.weight * max(_apparent_size(ladder.boxes, position, planes[:0]), _LEAST_SHARE)
-            first = ssim[0] if ssim[0] > 0 else 1.0
-            limit = _TURN * around * first / total[0]
-            behind.append((-limit, index, total[0]))
-        gains = gains_of(ssim, total)
-        ranked += [
-            (2, -min(weight * gain, limit), index, k)
-            for k, gain in zip(path[1:].tolist(), gains.tolist(), strict=True)
-        ]
-        ranked += [(3, 0.0, index, k) for k in skipped]
-    nearby = 0
-    for value, index, nbytes in sorted(behind):
-        nearby += nbytes
-        ranked.append((1 if nearby <= NEARBY else 2, value, index, 1))
-    return [(index, level) for *_, index, level in sorted(ranked)]
+        known = not np.isnan(mean[row]).any()
+        quality = mean[row, path - 1] if known else np.sqrt(total / total[-1])
+        weight = max(ladder.weight * max(float(share[row]), _LEAST_SHARE), _LEAST**2)
+        ranked.append((0 if visible else 1, -weight / total[0], cell, 1))
+        for k, gain in zip(path[1:].tolist(), gains_of(quality, total).tolist(), strict=True):
+            rank = 4 if not visible else 2 if k <= wanted[row] else 3
+            ranked.append((rank, -weight * gain, cell, k))
+        ranked += [(5, 0.0, cell, k) for k in skipped]
+    return [(cell, level) for *_, cell, level in sorted(ranked)]
 
 
 def gains_of(ssim: Float[np.ndarray, " K"], total: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K-1"]:
@@ -112,9 +107,10 @@ def write_pack(
 ) -> dict[str, Any]:
     """Write the increments of a manifest's labels, which are in `folder`, as one pack; its manifest entry."""
     unnamed, digest, size = folder / "scene.pack", hashlib.sha256(), 0
+    levels = {cell["id"]: cell["levels"] for label in labels for cell in label["cells"]}
     with unnamed.open("wb") as file:
-        for index, level in order:
-            entry = labels[index]["levels"][level - 1]
+        for cell, level in order:
+            entry = levels[cell][level - 1]
             with (folder / entry["uri"]).open("rb") as source:
                 source.seek(entry.get("offset", 0))
                 content = source.read(entry["bytes"])
@@ -125,55 +121,8 @@ def write_pack(
     return {"uri": uri, "bytes": size, "sha256": digest.hexdigest(), "order": [list(one) for one in order]}
 
 
-def _path(ladder: Ladder, camera: Camera, distance: float) -> tuple[np.ndarray, list[int]]:
-    """The levels whose files a viewer loads for the target, ascending; and those that it skips."""
+def _path(ladder: Ladder, wanted: int) -> tuple[np.ndarray, list[int]]:
+    """The levels whose files a viewer loads for a level, and beyond it; and those that it skips."""
     every = range(1, 1 + len(ladder.sizes))
-    if not ladder.replaces:
-        return np.array(every), []
-    wanted = len(ladder.sizes)
-    if ladder.model is not None:
-        reached = _predicted(ladder.model, camera, distance).bound[0] >= ladder.target
-        if reached.any():
-            wanted = ladder.model.levels[int(reached.argmax())]
     start = max((level for level in ladder.replaces if level <= wanted), default=1)
     return np.array([1, *range(max(start, 2), len(ladder.sizes) + 1)]), list(every[1 : start - 1])
-
-
-def _expected(
-    ladder: Ladder, camera: Camera, distance: float, path: np.ndarray, total: np.ndarray
-) -> np.ndarray:
-    """Expected SSIM by level; without a model the square root of the share of bytes, as in the planner."""
-    if ladder.model is None:
-        return np.sqrt(total / total[-1])
-    ssim = np.full(len(ladder.sizes), np.nan)
-    ssim[np.array(ladder.model.levels) - 1] = _predicted(ladder.model, camera, distance).mean[0]
-    return ssim[path - 1]
-
-
-def _predicted(model: ViewModel, camera: Camera, distance: float) -> Prediction:
-    return model.predict(np.array([distance]), *where([camera], model.focal))
-
-
-def _share(
-    ladder: Ladder, cameras: Sequence[Camera], camera: Camera, position: np.ndarray, planes: np.ndarray
-) -> float:
-    """Pixel share: kernel-weighted mean over the known views; without a model the apparent size."""
-    if ladder.model is None or ladder.shares is None:
-        return _apparent_size(ladder.boxes, position, planes)
-    extent = ladder.model.extent
-    here, known = (  # of place alone
-        np.array([[*one.position / extent, *one.direction, 0.0, 0.0] for one in some], np.float64)
-        for some in ([camera], cameras)
-    )
-    near = matern32(here, known, ladder.model.lengths)[0]
-    return float(near @ ladder.shares / near.sum()) if near.sum() > 1e-12 else float(ladder.shares.mean())
-
-
-def _apparent_size(category: np.ndarray, position: np.ndarray, planes: np.ndarray) -> float:
-    """Apparent size of boxes: mean of (half diagonal / distance)^2, each at most 1; 0 out of sight."""
-    near = category[boxes.touching(category, planes)]
-    if not len(near):
-        return 0.0
-    distance = np.linalg.norm((near[:, :3] + near[:, 3:]) / 2 - position, axis=1)
-    half = np.linalg.norm(near[:, 3:] - near[:, :3], axis=1) / 2
-    return float((np.minimum(1, half / np.maximum(distance, 1e-9)) ** 2).sum() / len(category))

@@ -1,5 +1,9 @@
 """promises-*.json: the viewpoint models of all categories for one quality, small enough to be sent.
 
+Fidelity has a model for each cell, whose categories are promised what compositions of the cells' levels keep:
+thresholds go up by as much as rounding changes the means of compositions. SSIM against photos has one model
+for each category.
+
 A mean over the viewpoint is written as its values at the model's views, not as weights. Weights cancel each
 other and need many digits; a value that is rounded moves the mean by about as much. A reader solves for them
 (`viewer.sent_model`). An offset holds what does not depend on the viewpoint: the mean of fidelity, and what
@@ -18,6 +22,9 @@ from jaxtyping import Float, Int
 from scipy.linalg import lstsq
 from scipy.spatial.distance import cdist
 
+from sagesplat.adapt.cell_models import CellModel, Expected, FidelityModel, expect
+from sagesplat.adapt.cells import Cells
+from sagesplat.adapt.fidelity_models import NOMINAL, plan_nominal
 from sagesplat.adapt.process import matern32
 from sagesplat.adapt.viewpoint import Calibration, Prediction, QualityKind, ViewModel, where
 from sagesplat.scene.scene import Camera
@@ -25,56 +32,205 @@ from sagesplat.viewer.quality import curve_entry, significant
 from sagesplat.viewer.sent_model import (
     AXES,
     CORRECTION_STEP,
+    FACTOR_STEP,
     STEP,
     STEPS_PER_UNIT,
     covariance,
-    inputs_of_entry,
     model_of_entry,
+    read_fidelity,
 )
 
 MAX_ROUNDING_CHANGE = 5e-4  # of a mean, in any of the model's views and halfway to the next one; or
 RELATIVE_ROUNDING = 1e-2  # this part of what is missing to 1, if that is more
 MOST_VIEWS = 1024  # of a model; of more every second, third, ... is sent: a browser solves for the weights
-# units of log distances and of values, the coarsest first
+LOG_UNIT = 0.01  # of cells' log distances
+UNIT_OF_MISSING = 0.02  # units of a cell's values over what its mean misses to 1,
+VALUE_UNITS = (5e-4, 5e-3)  # within these
+# units of a label's log distances and values, the coarsest first
 _UNITS = ((1e-2, 1e-3), (5e-3, 7e-4), (5e-3, 5e-4), (2e-3, 5e-4), (1e-3, 3e-4), (5e-4, 1e-4), (1e-5, 1e-5))
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A category in V viewpoints."""
+    """A category in V photos."""
 
     shares: Float[np.ndarray, " V"]  # of the image's pixels; 0: too few to count
     distance: Float[np.ndarray, " V"]  # d_min, world units; NaN: unknown
-    corrections: Float[np.ndarray, " V"] | None = None  # log of d_min over the distance by boxes; None: 0
+    corrections: Float[np.ndarray, " V"] | None = None  # log of d_min over the distance by points; None: 0
 
 
-def promises_document(
-    quality: QualityKind, models: Mapping[int, ViewModel], cameras: Sequence[Camera], seen: Mapping[int, Seen]
+def ssim_document(
+    models: Mapping[int, ViewModel], cameras: Sequence[Camera], seen: Mapping[int, Seen]
 ) -> dict[str, Any]:
-    """The document of at least one model. `cameras`: the V viewpoints that `seen` is about."""
+    """The document of SSIM against photos, of at least one model. `cameras`: the V photos of `seen`."""
     some = next(iter(models.values()))
-    at = where(cameras, some.focal)
-    views = some.inputs_at(np.ones(len(cameras)), *at)[:, :7]
+    views = some.inputs_at(np.ones(len(cameras)), *where(cameras, some.focal))[:, :7]
     rows = {label: _nearest(model.inputs[:, :7], views) for label, model in models.items()}
     used = np.unique(np.concatenate(list(rows.values())))
     used = used[_path(views[used])]
     place = np.zeros(len(views), int)
     place[used] = np.arange(len(used))
-    shared = np.round(views[used] * AXES / STEP).astype(int)
+    head, shared, photos = _head("ssim", some, views[used])
+    entries = [
+        _entry(model, place[rows[label]], rows[label], used, shared, photos, head, seen.get(label))
+        for label, model in models.items()
+    ]
+    return {**head, "labels": entries}
+
+
+def _head(
+    quality: QualityKind, some: ViewModel | FidelityModel, views: Float[np.ndarray, "U 7"]
+) -> tuple[dict[str, Any], Int[np.ndarray, "U 7"], Int[np.ndarray, "6 P"]]:
+    """What all labels share, and the views and photos of it in whole steps."""
+    shared = np.round(views * AXES / STEP).astype(int)
     photos = some.photos.T[_path(some.photos.T)]
     photos = np.round(photos * AXES[:6] / STEP).astype(int).T
-    return {
+    head = {
         "quality": quality,
         "extent": some.extent,
         "focal": significant(some.focal),
         "screens": significant(some.screens),
         "views": [_differences(column) for column in shared.T],
         "photos": [_differences(column) for column in photos],
-        "labels": [
-            _entry(model, place[rows[label]], rows[label], used, shared, photos, seen.get(label))
-            for label, model in models.items()
-        ],
     }
+    return head, shared, photos
+
+
+def fidelity_document(
+    models: Mapping[int, FidelityModel],
+    files: Mapping[int, Sequence[int]],
+    last: int,
+    cells: Cells,
+    cost: Int[np.ndarray, "C K"],
+    cameras: Sequence[Camera],
+) -> dict[str, Any]:
+    """The document of fidelity, of at least one model.
+
+    Args:
+        models: By label id, with the ladder's levels; their views are the same.
+        files: By cell id, the levels of its files; at least one each.
+        last: The last of the nested levels.
+        cells: All of the bundle.
+        cost: Bytes of their levels (`costs_of`).
+        cameras: Viewpoints where compositions' means are compared with what is sent of them.
+    """
+    some = next(iter(models.values()))
+    order = _path(some.views)
+    place = np.argsort(order)
+    head, shared, _ = _head("fidelity", some, some.views[order])
+    views = shared / STEPS_PER_UNIT * AXES
+    entries: list[dict[str, Any]] = []
+    for label, model in models.items():
+        entry: dict[str, Any] = {
+            "id": label,
+            "status": model.status,
+            "confidence": model.confidence,
+            "leastSupport": math.ceil(model.calibration.least_support / STEP) / STEPS_PER_UNIT,
+            "lengths": significant(model.lengths),
+            **_thresholds(model.calibration, 0.0),
+            "cells": [
+                _cell(model, cell, levels_of_files(files[cell.cell], last), place, order, views)
+                for cell in model.cells
+                if cell.cell in files
+            ],
+        }
+        entries.append(entry)
+    document = {**head, "labels": entries}
+    kept = of_cells(models, files, last)
+    before, after = (expect(some, cells, cameras, cost.shape[1]) for some in (kept, read_fidelity(document)))
+    changes = _changes(kept, before, after, cost)
+    for entry in entries:
+        entry |= _thresholds(models[entry["id"]].calibration, changes[entry["id"]])
+    return document
+
+
+def _changes(
+    models: Mapping[int, FidelityModel], before: Expected, after: Expected, cost: Int[np.ndarray, "C K"]
+) -> dict[int, float]:
+    """By label id, the largest change of what its compositions' bounds come from, over what is allowed.
+
+    Tried are all cells at one level, and the levels that reach targets.
+    """
+    V, C = before.share.shape
+    tried = [np.full((V, C), k + 1) for k in range(cost.shape[1])]
+    tried += list(plan_nominal(models, after, cost, NOMINAL).transpose(1, 0, 2))
+    worst = np.zeros(len(before.labels))
+    steepest = np.array(
+        [
+            np.abs(models[label].calibration.slopes).max(initial=0.0) if label in models else 0.0
+            for label in before.labels.tolist()
+        ]
+    )
+    away = np.abs(after.away - before.away)[:, None] * steepest
+    for levels in tried:
+        known, told = before.of_composition(levels), after.of_composition(levels)
+        change = (np.abs(told - known) + away) / allowed_change(known)
+        worst = np.maximum(worst, np.nan_to_num(change).max(0, initial=0.0))
+    return dict(zip(before.labels.tolist(), worst.tolist(), strict=True))
+
+
+def _cell(
+    model: FidelityModel,
+    cell: CellModel,
+    columns: Int[np.ndarray, " k"],
+    place: Int[np.ndarray, " V"],
+    order: Int[np.ndarray, " V"],
+    views: Float[np.ndarray, "V 7"],
+) -> dict[str, Any]:
+    """The entry of a cell; `place`: of each view among the shared ones `views`, `order` the reverse of it."""
+    by_place = np.argsort(place[cell.rows], kind="stable")[_sent_views(len(cell.rows))]
+    known = np.column_stack([model.views[cell.rows], cell.log_distances])
+    sent, weights = known[by_place], cell.weights.T[:, columns]
+    factors = np.where(cell.factors < 0, -1, np.round(cell.factors / FACTOR_STEP))[order]
+    entry = {
+        "id": cell.cell,
+        "levels": list(range(1, len(columns) + 1)),
+        "medianLogDistance": significant(cell.median_log_distance, 4),
+        "offsets": cell.offsets[columns].round(4).tolist(),
+        "views": _differences(place[cell.rows][by_place]),
+        "logDistances": {"unit": LOG_UNIT, "steps": []},
+        "values": {"units": [VALUE_UNITS[0]] * len(columns), "steps": [[] for _ in columns]},
+        "factors": _differences(factors),
+    }
+    if not len(sent):
+        return entry
+    logs = np.round(sent[:, 7] / LOG_UNIT)
+    inputs = np.column_stack([views[place[cell.rows][by_place]], logs * LOG_UNIT])
+    expected = matern32(known, known, model.lengths) @ weights
+    found = lstsq(matern32(known, inputs, model.lengths), expected, cond=1e-9, lapack_driver="gelsy")
+    assert found is not None  # as its stub has it
+    values = covariance(inputs, model.lengths) @ found[0]
+    missing = 1 - (expected + cell.offsets[columns]).mean(0)
+    units = significant(np.clip(UNIT_OF_MISSING * missing, *VALUE_UNITS), 2)
+    entry["logDistances"]["steps"] = _differences(logs)
+    entry["values"] = {"units": units, "steps": _differences(np.round((values / units).T))}
+    return entry
+
+
+def levels_of_files(files: Sequence[int], last: int) -> Int[np.ndarray, " k"]:
+    """Columns of a model of all levels, for the levels of a cell's files; of equal levels the last one.
+
+    A level that adds nothing has no file. `last`: the last of the nested levels.
+    """
+    return np.array([*files[1:], last + 1], int) - 2
+
+
+def of_cells(
+    models: Mapping[int, FidelityModel], files: Mapping[int, Sequence[int]], last: int
+) -> dict[int, FidelityModel]:
+    """The models with levels 1, 2, ... by the files of each cell; above a cell's last level is that level."""
+    most = max(map(len, files.values()))
+
+    def numbered(cell: CellModel) -> CellModel:
+        columns = levels_of_files(files[cell.cell], last)
+        columns = columns[np.minimum(np.arange(most), len(columns) - 1)]
+        return replace(cell, offsets=cell.offsets[columns], weights=cell.weights[columns])
+
+    kept = {
+        label: tuple(numbered(cell) for cell in model.cells if cell.cell in files)
+        for label, model in models.items()
+    }
+    return {label: replace(models[label], cells=some) for label, some in kept.items() if some}
 
 
 def _entry(
@@ -84,12 +240,11 @@ def _entry(
     used: Int[np.ndarray, " U"],
     shared: Int[np.ndarray, "U 7"],
     photos: Int[np.ndarray, "6 P"],
+    head: dict[str, Any],
     seen: Seen | None,
 ) -> dict[str, Any]:
     """The entry of a model; `places`: its views among the shared ones, `rows`: among the cameras."""
-    flat = model.quality == "fidelity"  # its curves are constants
     offsets = model.heldout_variance * model.heldout_inputs @ model.weights
-    offsets += np.array([curve.median if flat else 0.0 for curve in model.curves])
     order = np.argsort(places, kind="stable")
     sent = order[_sent_views(len(order))]
     ordered = {name: getattr(model, name)[order] for name in ("inputs", "heldout_inputs", "weights")}
@@ -99,26 +254,34 @@ def _entry(
     )
     entry = {
         "id": model.label_id,
-        "levels": list(model.levels),
         "status": model.status,
         "confidence": model.confidence,
         "leastSupport": math.ceil(model.calibration.least_support / STEP) / STEPS_PER_UNIT,
-        "medianLogDistance": significant(model.median_log_distance),
         "lengths": significant(model.lengths),
-        "curves": [] if flat else [curve_entry(curve) for curve in model.curves],
+        "targets": [],
+        "thresholds": [],
+        "slopes": [],
+    }
+    whole = {
+        "id": -1,
+        "levels": list(model.levels),
+        "medianLogDistance": significant(model.median_log_distance),
+        "curves": [curve_entry(curve) for curve in model.curves],
         "offsets": offsets.round(6).tolist(),
         "views": _differences(places[sent]),
         "shares": _differences(np.round(shares / STEP)),
         "corrections": _differences(np.round(np.nan_to_num(corrections) / CORRECTION_STEP)),
     }
-    return _rounded(entry, replace(model, **ordered), shared, photos)
+    return _rounded(entry, whole, replace(model, **ordered), shared, photos, head)
 
 
 def _rounded(
     entry: dict[str, Any],
+    whole: dict[str, Any],
     model: ViewModel,
     shared: Int[np.ndarray, "U 7"],
     photos: Int[np.ndarray, "6 P"],
+    head: dict[str, Any],
 ) -> dict[str, Any]:
     """The entry with log distances, values and thresholds, in the coarsest units that are allowed."""
     own = model.inputs
@@ -130,8 +293,9 @@ def _rounded(
     coarser = allowed_change(before.mean.mean(0)) / MAX_ROUNDING_CHANGE
     sent, change = entry, math.inf
     for log_unit, unit in _UNITS if len(own) <= MOST_VIEWS else _UNITS[:1]:
-        sent = _with_values(entry, model, shared, log_unit, significant(unit * coarser, 4))
-        after = model_of_entry(sent, shared, photos, model.extent, model.screens).predict(*viewpoints)
+        valued = _with_values(whole, model, shared, log_unit, significant(unit * coarser, 4))
+        sent = {**entry, "cells": [valued]}
+        after = model_of_entry(sent, shared, photos, head).predict(*viewpoints)
         change = _relative_change(before, after, model.calibration.slopes)
         if change <= 1:
             break
@@ -139,29 +303,26 @@ def _rounded(
 
 
 def _with_values(
-    entry: dict[str, Any],
+    whole: dict[str, Any],
     model: ViewModel,
     shared: Int[np.ndarray, "U 7"],
     log_unit: float,
     units: Sequence[float],
 ) -> dict[str, Any]:
-    """The entry with log distances and values, by which it predicts what the model does."""
-    own = model.inputs
-    logs = _differences(np.round(own[_sent_views(len(own)), 7] / log_unit))
-    sent = {
-        **entry,
-        "logDistances": {"unit": log_unit, "steps": logs},
-        "targets": [],
-        "thresholds": [],
-        "slopes": [],
-    }
-    inputs = inputs_of_entry(sent, shared)
+    """The model's entry with log distances and values, by which it predicts what the model does."""
+    own, some = model.inputs, _sent_views(len(model.inputs))
+    logs = np.round(own[some, 7] / log_unit)
+    views = shared[np.cumsum(whole["views"])] / STEPS_PER_UNIT * AXES
+    inputs = np.column_stack([views, logs * log_unit])
     expected = matern32(own, own, model.lengths) @ model.weights
     found = lstsq(matern32(own, inputs, model.lengths), expected, cond=1e-9, lapack_driver="gelsy")
     assert found is not None  # as its stub has it
     values = covariance(inputs, model.lengths) @ found[0]
-    sent["values"] = {"units": units, "steps": _differences(np.round((values / units).T))}
-    return sent
+    return {
+        **whole,
+        "logDistances": {"unit": log_unit, "steps": _differences(logs)},
+        "values": {"units": units, "steps": _differences(np.round((values / units).T))},
+    }
 
 
 def _relative_change(before: Prediction, after: Prediction, slopes: Float[np.ndarray, " G"]) -> float:
@@ -199,7 +360,7 @@ def _differences(whole: np.ndarray) -> list[Any]:
 
 def _sent_views(views: int) -> slice:
     """Which of a number of views are sent."""
-    return slice(None, None, math.ceil(views / MOST_VIEWS))
+    return slice(None, None, max(1, math.ceil(views / MOST_VIEWS)))
 
 
 def _nearest(a: Float[np.ndarray, "A D"], b: Float[np.ndarray, "B D"]) -> Int[np.ndarray, " A"]:

@@ -2,31 +2,59 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from sagesplat.adapt.cell_models import FidelityModel, expect, promised
+from sagesplat.adapt.cells import Cells
 from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.viewpoint import ViewModel
+from sagesplat.scene.scene import Camera
 
 MAX_CURVE_CHANGE = 1e-4  # largest change of a curve by rounding, SSIM
 
 
-def of_files(model: ViewModel, files: Sequence[int], last: int) -> ViewModel:
-    """The model with levels renumbered 1, 2, ... by the label's files; `files`: the levels of the files.
+def levels_of(files: Collection[Sequence[int]], last: int) -> list[int]:
+    """The nested level that all cells of a label show at least, with each cell's first 1, 2, ... files.
 
-    A level that adds nothing has no file. Of levels with equal content the bound of the last one is kept, as
-    in plans. `last`: the last of the nested levels.
+    `files`: for each cell the levels of its files: a level that adds nothing has none. `last`: the last of
+    the nested levels.
     """
-    known, columns, curves = list(model.levels), [], []
-    for number, (first, after) in enumerate(pairwise([*files, last + 1]), 1):
-        if same := [level for level in known if first <= level < after]:
-            columns.append(known.index(same[-1]))
-            curves.append(replace(model.curves[columns[-1]], level=number))
+    shown = [[*(after - 1 for after in own[1:]), last] for own in files]
+    return [min(own[min(k, len(own) - 1)] for own in shown) for k in range(max(map(len, shown)))]
+
+
+def of_levels(model: ViewModel, levels: Sequence[int]) -> ViewModel:
+    """The model with levels renumbered 1, 2, ... (`levels_of`), each as promised of the last one below it."""
+    columns, curves = [], []
+    for number, level in enumerate(levels, 1):
+        if known := [column for column, own in enumerate(model.levels) if own <= level]:
+            columns.append(known[-1])
+            curves.append(replace(model.curves[known[-1]], level=number))
     return replace(model, curves=tuple(curves), weights=model.weights[:, columns])
+
+
+def fidelity_entries(
+    models: Mapping[int, FidelityModel], cells: Cells, cameras: Sequence[Camera], levels: int
+) -> dict[int, dict[str, Any]]:
+    """By label id `quality_entry` of fidelity: all cells at one level, from the viewpoints that show any.
+
+    `models`: with as many levels as said.
+    """
+    expected, found = expect(models, cells, cameras, levels), {}
+    composed = [expected.of_composition(np.full(expected.share.shape, k + 1)) for k in range(levels)]
+    mean = np.stack(composed, 2)
+    bound = np.stack([promised(models, expected, one) for one in composed], 2)
+    for column, label in enumerate(expected.labels.tolist()):
+        if label in models:
+            shown = ~np.isnan(mean[:, column, 0])
+            seen = mean[shown, column] if shown.any() else np.zeros((1, levels))
+            kept = bound[shown, column] if shown.any() else np.full((1, levels), np.nan)
+            found[label] = _entry(models[label], range(1, levels + 1), seen, kept)
+    return found
 
 
 def quality_entry(model: ViewModel) -> dict[str, Any]:
@@ -37,12 +65,18 @@ def quality_entry(model: ViewModel) -> dict[str, Any]:
     """
     own = model.inputs
     predicted = model.predict(np.exp(own[:, 7]), own[:, :3] * model.extent, own[:, 3:6], np.exp(own[:, 6]))
-    low = np.quantile(predicted.bound, 1 - model.confidence, axis=0, method="lower")
+    return _entry(model, model.levels, predicted.mean, predicted.bound)
+
+
+def _entry(
+    model: ViewModel | FidelityModel, levels: Sequence[int], mean: np.ndarray, bound: np.ndarray
+) -> dict[str, Any]:
+    low = np.quantile(bound, 1 - model.confidence, axis=0, method="lower")
     return {
-        "levels": list(model.levels),
+        "levels": list(levels),
         "status": model.status,
         "confidence": model.confidence,
-        "mean": predicted.mean.mean(0).round(3).tolist(),
+        "mean": mean.mean(0).round(3).tolist(),
         "bound": None if np.isnan(low).any() else (np.floor(low * 1000) / 1000).tolist(),
     }
 

@@ -1,4 +1,4 @@
-"""A viewpoint model as promises-*.json holds it, and as a viewer evaluates it (`web/src/core/quality.ts`).
+"""Viewpoint models as promises-*.json holds them, and as a viewer evaluates them (`web/src/core/quality.ts`).
 
 The mean's weights are solved for, from the values at the model's views:
 
@@ -6,6 +6,7 @@ The mean's weights are solved for, from the values at the model's views:
     mean_k = curve_k(d) + offset_k + sum_i c(x, x_i) weights_ik
 
 Numbers are whole steps of a unit, lists over views hold differences to the view before (`viewer.promises`).
+Fidelity is read as models of cells (`read_fidelity`), SSIM as one model a label (`read_model`).
 """
 
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
+from sagesplat.adapt.cell_models import CellModel, FidelityModel
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.process import inputs_of, matern32
 from sagesplat.adapt.viewpoint import Calibration, Prediction, away_from, means_at, monotone
@@ -26,23 +28,25 @@ NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncert
 STEP = 1e-4  # of positions over the extent, directions, log screens, shares, targets, thresholds and slopes
 AXES = np.array([*FLIP, *FLIP, 1.0])  # signs of position, direction and log screen in the bundle's axes
 CORRECTION_STEP = 5e-3
+FACTOR_STEP = 0.05
 STEPS_PER_UNIT = round(1 / STEP)
 NEIGHBOUR_EXPONENT = 16  # of the kernel weights in `corrected`: only close views count
 HALF_WEIGHT = 1e-3  # weight at which a correction counts by half
+_Lengths = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class SentModel:
-    """A model as a viewer evaluates it."""
+    """The model of SSIM against photos of a label as a whole, as a viewer evaluates it."""
 
     levels: tuple[int, ...]
-    curves: tuple[SsimModel, ...]  # empty: 0
+    curves: tuple[SsimModel, ...]
     offsets: Float[np.ndarray, " K"]
     extent: float
     median_log_distance: float
     screens: tuple[float, float]
     inputs: Float[np.ndarray, "n 8"]
-    lengths: tuple[float, float, float, float]
+    lengths: _Lengths
     photos: Float[np.ndarray, "6 P"]
     weights: Float[np.ndarray, "n K"]
     corrections: Float[np.ndarray, " n"]
@@ -59,8 +63,7 @@ class SentModel:
         screen = None if screen is None else np.clip(screen, *self.screens)
         x = inputs_of(distance, position, direction, self.extent, self.median_log_distance, screen)
         near = matern32(x, self.inputs, self.lengths)
-        curves = means_at(self.curves, distance) if self.curves else 0.0
-        mean = monotone(curves + self.offsets + near @ self.weights)
+        mean = monotone(means_at(self.curves, distance) + self.offsets + near @ self.weights)
         support = near.max(1)
         away = away_from(x, self.photos, support)
         return Prediction(mean, self.calibration.bound(mean, support, away), support, away)
@@ -71,65 +74,122 @@ class SentModel:
         position: Float[np.ndarray, "V 3"],
         direction: Float[np.ndarray, "V 3"],
     ) -> Float[np.ndarray, " V"]:
-        """Distances by boxes, corrected by their errors in the model's views nearby.
+        """Distances by points, corrected by their errors in the model's views nearby.
 
-        d exp(sum_i a_i^16 c_i / (sum_i a_i^16 + 0.001)), where a_i is the model's kernel of place alone. In
-        leave-one-out tests on `garden` and `dinosaur` this halves the error of the bounds.
+        d exp(sum_i a_i^16 c_i / (sum_i a_i^16 + 0.001)), where a_i is the model's kernel of place alone.
         """
-        here = np.column_stack([position / self.extent, direction, np.zeros((len(position), 2))])
-        known = np.column_stack([self.inputs[:, :6], np.zeros((len(self.inputs), 2))])
-        weights = matern32(here, known, self.lengths) ** NEIGHBOUR_EXPONENT
+        here = np.column_stack([position / self.extent, direction])
+        weights = matern32(here, self.inputs[:, :6], self.lengths[:2]) ** NEIGHBOUR_EXPONENT
         return distance * np.exp(weights @ self.corrections / (weights.sum(1) + HALF_WEIGHT))
 
 
 def read_model(document: dict[str, Any], label_id: int) -> SentModel:
-    """The model of a label in a document."""
+    """The model of a label in a document of SSIM against photos."""
     (entry,) = (entry for entry in document["labels"] if entry["id"] == label_id)
-    shared, photos = np.cumsum(document["views"], 1).T, np.cumsum(document["photos"], 1, dtype=int)
-    return model_of_entry(entry, shared, photos, document["extent"], document["screens"])
+    return model_of_entry(entry, _steps(document["views"]), _steps(document["photos"]).T, document)
 
 
 def model_of_entry(
     entry: dict[str, Any],
     shared: Int[np.ndarray, "U 7"],
     photos: Int[np.ndarray, "6 P"],
-    extent: float,
-    screens: Sequence[float],
+    document: dict[str, Any],
 ) -> SentModel:
     """The model of an entry; `shared`, `photos`: the views and photos that the labels share, in steps."""
-    inputs = inputs_of_entry(entry, shared)
-    lengths = position, direction, screen, distance = entry["lengths"]
-    values = np.cumsum(np.cumsum(entry["values"]["steps"], 0), 1).T * entry["values"]["units"]
-    weights = cho_solve(cho_factor(covariance(inputs, lengths)), values)
+    (whole,) = entry["cells"]
+    views, screens = shared / STEPS_PER_UNIT * AXES, document["screens"]
+    inputs = _inputs(whole, views)
+    return SentModel(
+        levels=tuple(whole["levels"]),
+        curves=tuple(curve_of(curve) for curve in whole["curves"]),
+        offsets=np.array(whole["offsets"], np.float64),
+        extent=document["extent"],
+        median_log_distance=whole["medianLogDistance"],
+        screens=(screens[0], screens[1]),
+        inputs=inputs,
+        lengths=_lengths(entry),
+        photos=(photos.T / STEPS_PER_UNIT * AXES[:6]).T,
+        weights=_weights(whole, inputs, entry["lengths"]),
+        corrections=np.cumsum(whole["corrections"]) * CORRECTION_STEP,
+        calibration=calibration_of(entry),
+    )
+
+
+def read_fidelity(document: dict[str, Any]) -> dict[int, FidelityModel]:
+    """The models of a document of fidelity by label id, all with as many levels.
+
+    What lies above the last level of a cell is that level.
+    """
+    views = _steps(document["views"]) / STEPS_PER_UNIT * AXES
+    photos = (_steps(document["photos"]) / STEPS_PER_UNIT * AXES[:6]).T
+    most = max(max(cell["levels"]) for entry in document["labels"] for cell in entry["cells"])
+    low, high = document["screens"]
+    return {
+        entry["id"]: FidelityModel(
+            label_id=entry["id"],
+            extent=document["extent"],
+            focal=document["focal"],
+            screens=(low, high),
+            views=views,
+            lengths=_lengths(entry),
+            photos=photos,
+            cells=tuple(_cell(cell, views, entry["lengths"], most) for cell in entry["cells"]),
+            rmse=0.0,
+            calibration=calibration_of(entry),
+        )
+        for entry in document["labels"]
+    }
+
+
+def _cell(
+    cell: dict[str, Any], views: Float[np.ndarray, "U 7"], lengths: Sequence[float], levels: int
+) -> CellModel:
+    columns = np.minimum(np.arange(levels), len(cell["levels"]) - 1)
+    inputs, factors = _inputs(cell, views), np.cumsum(cell["factors"])
+    weights = _weights(cell, inputs, lengths) if len(inputs) else np.zeros((0, len(cell["levels"])))
+    return CellModel(
+        cell=cell["id"],
+        offsets=np.array(cell["offsets"], np.float64)[columns],
+        rows=np.cumsum(np.array(cell["views"], int)),
+        log_distances=inputs[:, 7],
+        median_log_distance=cell["medianLogDistance"],
+        weights=weights.T[columns],
+        factors=np.where(factors < 0, -1.0, factors * FACTOR_STEP),
+    )
+
+
+def calibration_of(entry: dict[str, Any]) -> Calibration:
+    """The calibration of a label's entry."""
     targets, thresholds, slopes = (
         np.array(entry[name], np.float64) / STEPS_PER_UNIT for name in ("targets", "thresholds", "slopes")
     )
-    calibration = Calibration(
+    return Calibration(
         entry["status"], entry["confidence"], 0, targets, thresholds, slopes, entry["leastSupport"]
     )
-    return SentModel(
-        levels=tuple(entry["levels"]),
-        curves=tuple(curve_of(curve) for curve in entry["curves"]),
-        offsets=np.array(entry["offsets"], np.float64),
-        extent=extent,
-        median_log_distance=entry["medianLogDistance"],
-        screens=(screens[0], screens[1]),
-        inputs=inputs,
-        lengths=(position, direction, screen, distance),
-        photos=(photos.T / STEPS_PER_UNIT * AXES[:6]).T,
-        weights=weights,
-        corrections=np.cumsum(entry["corrections"]) * CORRECTION_STEP,
-        calibration=calibration,
-    )
-
-
-def inputs_of_entry(entry: dict[str, Any], shared: Int[np.ndarray, "U 7"]) -> Float[np.ndarray, "n 8"]:
-    """Scaled position, direction, log screen and log distance of an entry's views."""
-    own = shared[np.cumsum(entry["views"])] / STEPS_PER_UNIT * AXES
-    logs = np.cumsum(entry["logDistances"]["steps"]) * entry["logDistances"]["unit"]
-    return np.column_stack([own, logs])
 
 
 def covariance(inputs: Float[np.ndarray, "n 8"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
     """The kernel between all views, with the nugget."""
     return matern32(inputs, inputs, lengths) + NUGGET * np.eye(len(inputs))
+
+
+def _inputs(cell: dict[str, Any], views: Float[np.ndarray, "U 7"]) -> Float[np.ndarray, "n 8"]:
+    """Scaled position, direction, log screen and log distance of a cell's views."""
+    logs = np.cumsum(cell["logDistances"]["steps"]) * cell["logDistances"]["unit"]
+    return np.column_stack([views[np.cumsum(np.array(cell["views"], int))], logs])
+
+
+def _weights(
+    cell: dict[str, Any], inputs: Float[np.ndarray, "n 8"], lengths: Sequence[float]
+) -> Float[np.ndarray, "n K"]:
+    values = np.cumsum(np.cumsum(cell["values"]["steps"], 0), 1).T * cell["values"]["units"]
+    return cho_solve(cho_factor(covariance(inputs, lengths)), values)
+
+
+def _lengths(entry: dict[str, Any]) -> _Lengths:
+    position, direction, screen, distance = entry["lengths"]
+    return position, direction, screen, distance
+
+
+def _steps(columns: Sequence[Sequence[int]]) -> Int[np.ndarray, "U D"]:
+    return np.cumsum(np.array(columns, int), 1).T

@@ -146,7 +146,8 @@ def _bundled(folder: Path, size: int) -> list[bytes]:
     chunk = {"uri": "chunks/a.spz", "count": 3, "bytes": 9, "gpuBytes": 9, "sha256": "0" * 64}
     files = [chunk, chunk | {"refine": "REPLACE"}] * size
     ranges = [chunk | {"uri": "chunks/a.sgst", "offset": 9 * i, "weight": 0.5} for i in range(size)]
-    labels = [{"id": i, "title": "sky", "levels": levels} for i, levels in enumerate((files, ranges))]
+    cells = [{"id": i, "levels": levels} for i, levels in enumerate((files, ranges))]
+    labels = [{"id": 3, "title": "sky", "cells": cells}]
     return as_json(*({"format": "sagesplat-bundle", "antialiased": True, "labels": [one]} for one in labels))
 
 

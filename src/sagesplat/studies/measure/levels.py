@@ -2,11 +2,12 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 from msgspec import Meta
 
 from sagesplat.core.errors import DataError, RunError
@@ -102,19 +103,25 @@ class _BundleLevel:
     offset: Count = 0
     weight: Share | None = None
 
-    def increment(self, label_id: int, number: int) -> Increment:
+    def increment(self, label_id: int, cell: int, number: int) -> Increment:
         uri = self.uri.removeprefix("chunks/")
         sizes = self.count, self.bytes, self.gpuBytes
         return Increment(
-            label_id, label_id, number, uri, *sizes, self.sha256, self.refine, self.offset, self.weight
+            label_id, cell, number, uri, *sizes, self.sha256, self.refine, self.offset, self.weight
         )
+
+
+@dataclass(frozen=True)
+class _BundleCell:
+    id: LabelId
+    levels: list[_BundleLevel]
 
 
 @dataclass(frozen=True)
 class _BundleLabel:
     id: LabelId
     title: str
-    levels: list[_BundleLevel]
+    cells: list[_BundleCell]
 
 
 @dataclass(frozen=True)
@@ -129,9 +136,10 @@ def _of_bundle(path: Path, name: str) -> list[Level]:
     names = {label.id: repaired(label.title, "?") for label in manifest.labels}
     with refused(file, what, _BUNDLE_CURE):
         made = [
-            asdict(level.increment(label.id, number))
+            asdict(level.increment(label.id, cell.id, number))
             for label in manifest.labels
-            for number, level in enumerate(label.levels, 1)
+            for cell in label.cells
+            for number, level in enumerate(cell.levels, 1)
         ]
         listed = convert_as(made, list[Increment])
     return _of_chunks(path / "chunks", listed, names, name, manifest.antialiased is True)
@@ -154,15 +162,17 @@ def _of_chunks(
     folder: Path, listed: Sequence[Increment], names: dict[int, str], name: str, antialiased: bool,
     offset: Position = NO_OFFSET,
 ) -> list[Level]:  # fmt: skip
-    labels = sorted({chunk.label_id for chunk in listed})
-    if not labels:
+    label_of = {chunk.cell: chunk.label_id for chunk in sorted(listed, key=lambda one: one.cell)}
+    if not label_of:
         raise DataError(f"{folder.parent}: no levels in it; {_BUNDLE_CURE}")
     levels = []
     for number in sorted({chunk.level for chunk in listed}, reverse=True):
-        chunks = [chunk for label in labels for chunk in shown(listed, label, number)]
+        chunks = [chunk for cell in label_of for chunk in shown(listed, cell, number)]
 
         def load(chunks: Sequence[Increment] = chunks) -> Splat:
-            g = read_increments(folder, chunks)
+            g, table = read_increments(folder, chunks), torch.tensor(list(label_of.values()))
+            rows = torch.searchsorted(torch.tensor(list(label_of)), g.label_ids.long())
+            g = replace(g, label_ids=table[rows].to(g.label_ids.dtype))
             return Splat(g, "increments", names, antialiased, offset=offset)
 
         levels.append(Level(f"{name} level {number}", name, sum(chunk.nbytes for chunk in chunks), load))
