@@ -91,7 +91,7 @@ def in_cells(finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sagesplat.train.cells.FEWEST", 12)
         config = replace(SMALL_RUN, nest=replace(SMALL_RUN.nest, cells=6))
-        pipeline.run_all(job_of(path), finished_run.parent / "capture", config)
+        pipeline.run_all(replace(job_of(path), force=True), finished_run.parent / "capture", config)
     assert len(job_of(path).cells.ids) > 4
     return path
 
