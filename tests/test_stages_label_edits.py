@@ -12,7 +12,7 @@ import torch
 from conftest import SMALL_RUN
 
 import sagesplat
-from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.ladder import NestedLadder
 from sagesplat.adapt.observe import TOTAL, Observations, distances_in_views, observe
 from sagesplat.core.config import FitConfig, LabelsConfig, RunConfig, TrainConfig
 from sagesplat.core.errors import LabelError, RunError
@@ -68,10 +68,32 @@ def edited(run: Path, viewer: Path, *operations: Operation) -> LabelsApplied:
     return apply_labels(job, viewer=viewer)
 
 
-def ladder_of(path: Path) -> PrefixLadder:
+def ladder_of(path: Path) -> NestedLadder:
     ladder = job_of(path).ladder
-    assert isinstance(ladder, PrefixLadder)
+    assert isinstance(ladder, NestedLadder)
     return ladder
+
+
+def labels_of(path: Path) -> set[int]:
+    return {label for label, _ in ladder_of(path).counts}
+
+
+def sizes_of(ladder: NestedLadder, label: int) -> tuple[int, ...]:
+    return tuple(ladder.counts[label, level] for level in ladder.levels)
+
+
+@pytest.fixture(scope="module")
+def in_cells(finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run whose categories have several cells."""
+    path = tmp_path_factory.mktemp("cells") / "run"
+    shutil.copytree(finished_run, path)
+    (path.parent / "capture").symlink_to((finished_run.parent / "capture").resolve())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sagesplat.train.cells.FEWEST", 12)
+        config = replace(SMALL_RUN, nest=replace(SMALL_RUN.nest, cells=6))
+        pipeline.run_all(replace(job_of(path), force=True), finished_run.parent / "capture", config)
+    assert len(job_of(path).cells.ids) > 4
+    return path
 
 
 def manifest_of(made: LabelsApplied) -> dict:
@@ -119,7 +141,7 @@ def test_a_merged_category_has_the_levels_of_its_parts(run: Path, viewer: Path) 
     made = edited(run, viewer, Merge(TREE, CAR))
     assert not made.trained
     before, after = ladder_of(run), ladder_of(made.path)
-    assert set(after.sizes) == {3}
+    assert labels_of(made.path) == {3}
     for level in before.levels:
         assert after.counts[3, level] == before.counts[3, level] + before.counts[184, level]
         # a stream of its own rounds positions within half a step: the levels show the same Gaussians
@@ -156,13 +178,13 @@ def test_merged_observations_are_those_that_rendering_measures(run: Path, viewer
 
 def test_a_split_is_exact(run: Path, viewer: Path) -> None:
     before = ladder_of(run)
-    sizes = before.sizes[3]
+    sizes = sizes_of(before, 3)
     chosen = [0, 2, *range(sizes[0], sizes[0] + 3), sizes[-1] - 1]
     runs = ((0, 1), (2, 1), (sizes[0], 3), (sizes[-1] - 1, 1))
     made = edited(run, viewer, Split(CAR, "left car", {CAR: runs}))
     assert made.trained
     after = ladder_of(made.path)
-    (new,) = set(after.sizes) - set(before.sizes)
+    (new,) = labels_of(made.path) - labels_of(run)
     assert job_of(made.path).names()[new] == "left car"
     old = before.load(before.levels[-1], [3]).means.numpy()
     part = after.load(after.levels[-1], [new]).means.numpy()
@@ -172,7 +194,8 @@ def test_a_split_is_exact(run: Path, viewer: Path) -> None:
         assert after.counts[new, level] + after.counts[3, level] == size
     assert torch.equal(before.load(1, [184]).means, after.load(1, [184]).means)  # its file is the same
     sampled = sampled_of(job_of(made.path))
-    assert new in sampled.labels
+    assert sampled.labels == tuple(job_of(made.path).cells.ids.tolist())
+    assert new in job_of(made.path).cells.labels
 
 
 def test_parts_are_measured_as_everything_is(run: Path, viewer: Path) -> None:
@@ -191,10 +214,10 @@ def test_parts_are_measured_as_everything_is(run: Path, viewer: Path) -> None:
         np.testing.assert_allclose(one[exact], other[exact], atol=tolerance)  # back within float32
         np.testing.assert_allclose(one, other, atol=60 * tolerance)
     drawn, told = viewpoints_of(job), sampled_of(job)
-    measured = measured_levels(job, [drawn.cameras[row] for row in drawn.rows("fit")], config)
+    measured = measured_levels(job, [drawn.cameras[row] for row in drawn.rows("fit")])
     np.testing.assert_allclose(np.delete(told.whole, 2, -1), np.delete(measured.whole, 2, -1), atol=1e-4)
     np.testing.assert_allclose(told.whole, measured.whole, atol=0.02)
-    parts = np.isin(told.labels, [3, 201])
+    parts = np.isin(job.cells.labels, [3, 201])
     np.testing.assert_array_equal(told.pixels[:, parts], measured.pixels[:, parts])
     np.testing.assert_array_equal(told.fidelity[:, parts], measured.fidelity[:, parts])
 
@@ -205,10 +228,48 @@ def test_ranks_stay_those_of_the_run_after_a_merge(run: Path, viewer: Path) -> N
     )  # fmt: skip
     made = edited(run, viewer, *operations)
     after = ladder_of(made.path)
-    (new,) = set(after.sizes) - {184}
-    assert after.sizes[new][-1] == 42
+    (new,) = labels_of(made.path) - {184}
+    assert sizes_of(after, new)[-1] == 42
     assert job_of(made.path).names()[new] == "mixed"
     assert fidelity_of(job_of(made.path))
+
+
+def test_levels_of_merged_and_split_cells_are_those_of_before(in_cells: Path, viewer: Path) -> None:
+    before, old = ladder_of(in_cells), job_of(in_cells)
+    first, *_, last = before.cells_of(3)
+    count = before.cells.sizes[last][-1]
+    start = sizes_of(before, 3)[-1] - count  # ranks go through the cells, one after the other
+    operations = Split(CAR, "part", {CAR: ((start + 1, count - 1),)}), Merge(TREE, CAR)
+    made = edited(in_cells, viewer, *operations)
+    after, job = ladder_of(made.path), job_of(made.path)
+    (new,) = labels_of(made.path) - {3, -1}
+    assert sizes_of(after, new)[-1] == count - 1
+    assert sorted(job.cells.ids.tolist()) == list(range(len(old.cells.ids) + 1))
+    assert len(after.cells_of(3)) == len(before.cells_of(3)) + len(before.cells_of(184))
+    # grids stay those of the old cells, so nothing moves
+    for level in before.levels:
+        one, other = (np.sort(ladder.load(level).means.numpy(), 0) for ladder in (before, after))
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    # whole cells keep what was measured, and where they are
+    theirs, mine = sampled_of(old), sampled_of(job)
+    a, b = theirs.labels.index(first), mine.labels.index(after.cells_of(3)[0])
+    np.testing.assert_array_equal(theirs.fidelity[:, a], mine.fidelity[:, b])
+    np.testing.assert_array_equal(old.cells.points()[a], job.cells.points()[b])
+    models = fidelity_of(job)
+    assert {cell.cell for cell in models[3].cells} == set(after.cells_of(3))
+    assert increments_of(job)
+
+
+def test_models_of_other_categories_follow_their_cells(in_cells: Path, viewer: Path) -> None:
+    made = edited(in_cells, viewer, Split(CAR, "part", {CAR: ((0, 3),)}))
+    before, after = fidelity_of(job_of(in_cells))[184], fidelity_of(job_of(made.path))[184]
+    assert [one.cell for one in after.cells] == ladder_of(made.path).cells_of(184)
+    for one, other in zip(before.cells, after.cells, strict=True):
+        np.testing.assert_array_equal(one.offsets, other.offsets)
+    old, new = (
+        {one.uri for one in increments_of(job_of(p)) if one.label_id == 184} for p in (in_cells, made.path)
+    )
+    assert old == new  # its file is the same
 
 
 def test_scripts_apply_edits(run: Path, tmp_path: Path) -> None:

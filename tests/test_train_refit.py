@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from conftest import orbit, random_gaussians
 from hypothesis import given
@@ -17,7 +18,9 @@ from sagesplat.train.importance import importance
 from sagesplat.train.lower_levels import (
     Set,
     assemble,
+    by_label,
     first_of_all,
+    in_cells,
     joined,
     merged_rungs,
     size_of,
@@ -108,3 +111,25 @@ def test_a_ladder_of_merged_sets_and_originals() -> None:
         assert found == [level[label] for level in (*counts, most, g.counts())]
         assert found == sorted(found)
         assert ladder.replaces[label] == (3, 4)
+
+
+def test_cells_of_sets_have_every_level_and_the_same_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sagesplat.train.cells.FEWEST", 20)
+    g = random_gaussians(400, degree=0)
+    low = g.select(torch.arange(0, 400, 10))
+    most = {label: count // 2 for label, count in g.counts().items()}
+    ladder = assemble([whole(low), Set(g, (most, g.counts()))])
+    made, label_of = in_cells(ladder, 8)
+    assert len(label_of) > 4
+    assert set(made.gaussians.counts()) == set(label_of)
+    for level in range(3):
+        for label, sizes in ladder.sizes.items():
+            assert (
+                sum(made.sizes[cell][level] for cell in label_of if label_of[cell] == label) == sizes[level]
+            )
+    for sizes in made.sizes.values():
+        assert 0 < sizes[0] < sizes[1]  # each set replaces the one before
+    low_rows = np.concatenate([by_label(made.gaussians)[cell][: made.sizes[cell][0]] for cell in made.sizes])
+    one, other = made.gaussians.means[torch.from_numpy(low_rows)], low.means
+    assert np.array_equal(np.sort(one.numpy(), 0), np.sort(other.numpy(), 0))
+    assert len(in_cells(ladder, 0)[1]) == len(g.counts())

@@ -51,6 +51,10 @@ class Cells:
         """Label id by cell id."""
         return dict(zip(self.ids.tolist(), self.labels.tolist(), strict=True))
 
+    def select(self, rows: Int[np.ndarray, " n"] | Sequence[int]) -> "Cells":
+        """Some of them, by their rows."""
+        return Cells(**{name: array[rows] for name, array in vars(self).items()})
+
     def points(self) -> Float[np.ndarray, "C P 3"]:
         """The points' positions."""
         low, high = self.bounds[:, None, :3], self.bounds[:, None, 3:]

@@ -7,7 +7,7 @@ The full model is the last level; of a splat that was adopted it is what came in
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
-from sagesplat.adapt.observe import PERCENTILE, RenderedLabels, distances_in_views, render_rgb
+from sagesplat.adapt.observe import RenderedLabels, render_rgb
 from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
@@ -23,7 +23,7 @@ from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.metrics.image import box_of, means_by_label, ssim_map, tiles_around
 from sagesplat.raster import Backend, Workspace, device_of, each_view
-from sagesplat.scene.scene import Camera, Scene, View
+from sagesplat.scene.scene import Camera
 
 _KEEP = 10**9  # bytes of references that are kept
 PROMISED_SHARE = 2e-3  # of a picture that a category has to cover: of fewer pixels nothing is promised
@@ -255,17 +255,6 @@ class References:
             for label, wanted in zip(self.labels, self.wanted, strict=True)
         ]
         return np.array(by_label, np.float32), float(quality.mean()) if at.tile_mask is None else np.nan
-
-
-def distances_at(
-    scene: Scene, point_labels: np.ndarray, cameras: Sequence[Camera], labels: Sequence[int], method: str
-) -> Float32[np.ndarray, "V L"]:
-    """d_min of each category from each viewpoint, as `FitConfig.distance` says; NaN: none in sight."""
-    views = tuple(View(str(i), camera, Path()) for i, camera in enumerate(cameras))
-    percentile = PERCENTILE if method == "percentile" else 0.0
-    known = distances_in_views(replace(scene, views=views), point_labels, percentile)
-    nowhere = np.full(len(cameras), np.nan, np.float32)
-    return np.stack([known.get(label, nowhere) for label in labels], 1)
 
 
 def write_sampled(path: Path, sampled: SampledFidelity) -> None:

@@ -197,6 +197,10 @@ class NestedLadder(Ladder):
         """See `Ladder`."""
         return self.compose_cells(self.of_cells(levels))
 
+    def cells_of(self, label: int) -> list[int]:
+        """The ids of a category's cells, ascending: the order of its Gaussians."""
+        return sorted(cell for cell, of in self.label_of.items() if of == label)
+
     def of_cells(self, levels: Mapping[int, int]) -> dict[int, int]:
         """Level by cell id, from levels by label id."""
         return {cell: levels[label] for cell, label in self.label_of.items() if label in levels}

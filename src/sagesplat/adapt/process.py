@@ -75,8 +75,8 @@ class Together:
     """Processes with the same hyperparameters; weights and views left out of each, as of `Process`."""
 
     lengths: tuple[float, float, float, float]
-    weights: list[Float[np.ndarray, "n K"]]
-    left_out: list[Float[np.ndarray, "n K"]]
+    weights: list[Float[np.ndarray, "_ K"]]
+    left_out: list[Float[np.ndarray, "_ K"]]
 
 
 def fit_process(

@@ -1,77 +1,75 @@
-"""Levels and measurements of other categories, made from those of the old ones without rendering.
+"""Cells and measurements of other categories, made from those of the old ones without rendering.
 
-Level k of a merged category is the union of level k of its parts, and level k of a part is what it has of
-level k: with all categories at the same level the Gaussians are those of before, and so is every image (but
+What a new category has of an old cell is a cell, whose levels are what it has of that cell's levels, in their
+order: with all categories at the same level the Gaussians are those of before, and so is every image (but
 where a part is complete before the last level: a stream gives levels that show the same Gaussians the last
-one's opacities; calibration measures these compositions again). Means
-over the pixels of merged categories are then means, weighted by pixels, of those that are known.
+one's opacities; calibration measures these compositions again). A cell that is whole keeps what was measured
+of it, and means over the pixels of merged categories are means, weighted by pixels, of those that are known.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Int16
+from jaxtyping import Int16, Int64
 
 from sagesplat.adapt.fidelity import SampledFidelity
-from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.ladder import NestedLadder, PrefixLadder
 from sagesplat.adapt.observe import TOTAL, Observations
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
 
-_STEPS = 255  # of weights of second opacities
 _WORST = 1e-10  # squared error that counts as none, as in `metrics.image.psnr`
 
 
-def regrouped(
-    ladder: PrefixLadder, new_ids: Mapping[int, Int16[np.ndarray, " _"]], labels: Sequence[int]
-) -> tuple[Gaussians, dict[int, tuple[int, ...]], SecondOpacities | None]:
-    """The Gaussians of some new categories in the order of their levels.
+@dataclass(frozen=True, eq=False)
+class NewCell:
+    """What a new category has of an old cell."""
+
+    label_id: int  # of the new category
+    old: int  # id of the old cell
+    rows: Int64[np.ndarray, " n"]  # among all Gaussians of the ladder, in the order of the levels
+    sizes: tuple[int, ...]  # Gaussians up to the end of each level
+    whole: bool  # whether it has all of the old cell
+
+
+def new_cells(ladder: NestedLadder, new_ids: Mapping[int, Int16[np.ndarray, " _"]]) -> dict[int, NewCell]:
+    """The new cells by id: numbered from 0, by new category and there by old cell.
 
     Args:
         ladder: Levels, none of which replaces those below it.
-        new_ids: By old label id, the new one of each Gaussian, by rank.
-        labels: The new categories that are wanted, ascending.
-
-    Returns:
-        The Gaussians; by new id, how many there are up to the end of each level; second opacities, where the
-        ladder has some: the weight of a level is the mean of those of its parts, in steps of 1/255.
+        new_ids: By old label id, the new one of each Gaussian, by rank: cells by id, each in its order.
     """
-    rows, sizes, weights = [], {}, {}
-    for new in labels:
-        parts = _ranks_by_level(ladder, new_ids, new)
-        rows += [some for level in parts for some in level]
-        counts = [sum(map(len, level)) for level in parts]
-        sizes[new] = tuple(np.cumsum(counts).tolist())
-        if ladder.second is not None:
-            weights[new] = _weights(ladder.second, new_ids, new)
-    order = torch.from_numpy(np.concatenate(rows))
-    g = ladder.gaussians.select(order)
-    ids = np.repeat(np.array(labels, np.int16), [sizes[new][-1] for new in labels])
-    second = None if ladder.second is None else SecondOpacities(ladder.second.logits[order], weights)
-    return replace(g, label_ids=torch.from_numpy(ids)), sizes, second
+    found = []
+    for label, ids in new_ids.items():
+        end = 0
+        for cell in ladder.cells_of(label):
+            sizes, begin = ladder.cells.sizes[cell], end
+            end += sizes[-1]
+            own, first = ids[begin:end], ladder.cells.ranges[cell][0][0]
+            for new in np.unique(own).tolist():
+                ranks = np.flatnonzero(own == new)
+                counts = tuple(np.searchsorted(ranks, sizes).tolist())
+                found.append(NewCell(new, cell, first + ranks, counts, len(ranks) == len(own)))
+    return dict(enumerate(sorted(found, key=lambda one: (one.label_id, one.old))))
 
 
-def _ranks_by_level(
-    ladder: PrefixLadder, new_ids: Mapping[int, np.ndarray], new: int
-) -> list[list[np.ndarray]]:
-    """Rows of a new category among all Gaussians: by level, and there by old category."""
-    parts: list[list[np.ndarray]] = [[] for _ in ladder.levels]
-    for old, ids in new_ids.items():
-        mine, first = np.flatnonzero(ids == new), ladder.ranges[old][0][0]
-        ends = np.searchsorted(mine, ladder.sizes[old])
-        for level, ranks in enumerate(np.split(mine, ends[:-1])):
-            parts[level].append(first + ranks)
-    return parts
+def regrouped(
+    ladder: PrefixLadder, cells: Mapping[int, NewCell]
+) -> tuple[Gaussians, dict[int, tuple[int, ...]], SecondOpacities | None]:
+    """The Gaussians of new cells, with their ids; the sizes of their levels; second opacities, if there are.
 
-
-def _weights(second: SecondOpacities, new_ids: Mapping[int, np.ndarray], new: int) -> tuple[float, ...]:
-    counts = {old: int((ids == new).sum()) for old, ids in new_ids.items()}
-    shares = np.array([counts[old] for old in counts if counts[old]], np.float64)
-    of_parts = np.array([second.weights[old] for old in counts if counts[old]])
-    mean = (shares / shares.sum()) @ of_parts
-    return tuple((np.round(mean * _STEPS) / _STEPS).tolist())
+    The weights of second opacities are those of the old cells.
+    """
+    rows = torch.from_numpy(np.concatenate([np.arange(0), *(one.rows for one in cells.values())]))
+    ids = np.repeat(np.array(list(cells), np.int16), [len(one.rows) for one in cells.values()])
+    g = replace(ladder.gaussians.select(rows), label_ids=torch.from_numpy(ids))
+    sizes, second = {cell: one.sizes for cell, one in cells.items()}, ladder.second
+    if second is not None:
+        weights = {cell: second.weights[one.old] for cell, one in cells.items()}
+        second = SecondOpacities(second.logits[rows], weights)
+    return g, sizes, second
 
 
 def regrouped_observations(
@@ -115,33 +113,10 @@ def _means(values: np.ndarray, weights: np.ndarray, group: np.ndarray, n: int) -
     return np.divide(found, total, out=np.full(n, np.nan), where=total > 0)
 
 
-def regrouped_samples(
-    sampled: SampledFidelity, moved: Mapping[int, int | None], distance: np.ndarray, labels: Sequence[int]
-) -> SampledFidelity:
-    """Sampled fidelity of merged categories, weighted by pixels; NaN for those that `moved` is None of.
-
-    Exact but for pixels at borders: in the label image of the full model two parts together can paint most of
-    a pixel that neither painted most of.
-
-    `moved`: by old id the new one; None for one that was split. `distance`: d_min of the new categories
-    `labels` (ascending) at the viewpoints, [V, L].
-    """
-    V, _, K = sampled.fidelity.shape
-    total = np.zeros((V, len(labels), K))
-    pixels = np.zeros((V, len(labels)), np.int64)
-    for column, old in enumerate(sampled.labels):
-        if (to := moved[old]) is None:
-            continue
-        at = labels.index(to)
-        mine = sampled.pixels[:, column]
-        pixels[:, at] += mine
-        total[:, at] += (
-            np.where(mine[:, None] > 0, np.nan_to_num(sampled.fidelity[:, column]), 0) * mine[:, None]
-        )
-    fidelity = np.divide(
-        total, pixels[..., None], out=np.full(total.shape, np.nan), where=pixels[..., None] > 0
+def regrouped_samples(sampled: SampledFidelity, cells: Mapping[int, NewCell]) -> SampledFidelity:
+    """Sampled fidelity of new cells: each has what was measured of its old cell."""
+    columns = [sampled.labels.index(one.old) for one in cells.values()]
+    names = ("fidelity", "pixels", "distance")
+    return replace(
+        sampled, labels=tuple(cells), **{name: getattr(sampled, name)[:, columns] for name in names}
     )
-    return SampledFidelity(
-        tuple(labels), fidelity.astype(np.float32), pixels.astype(np.int32), sampled.image, sampled.whole,
-        distance.astype(np.float32),
-    )  # fmt: skip

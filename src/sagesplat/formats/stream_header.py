@@ -1,7 +1,6 @@
 """The header of a coded stream, and the steps by which it turns Gaussians into integers and back."""
 
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,11 +68,9 @@ class Grid:
     rotation_origin: int  # steps of log scales
 
     @classmethod
-    def finest(cls, headers: Sequence["Header"]) -> "Grid":
-        """The finest of several streams'."""
-        return cls(
-            min(one.step for one in headers), min(one.rotation_origin + one.scale_origin for one in headers)
-        )
+    def of(cls, header: "Header") -> "Grid":
+        """That of a stream."""
+        return cls(header.step, header.rotation_origin + header.scale_origin)
 
 
 @dataclass(frozen=True)

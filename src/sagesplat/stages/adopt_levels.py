@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from sagesplat.adapt.cells import describe_cells, write_cells
-from sagesplat.adapt.ladder import read_prefixes
+from sagesplat.adapt.ladder import NestedLadder, read_prefixes
 from sagesplat.adapt.observe import as_unit, render_rgb
 from sagesplat.adapt.renders import Renders
 from sagesplat.core.config import AdoptConfig, NestConfig
@@ -26,6 +26,7 @@ from sagesplat.scene.images import Photos
 from sagesplat.stages.memory import check_nest
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
+from sagesplat.train.cells import cells_wanted
 from sagesplat.train.checkpoint import remove_checkpoints
 from sagesplat.train.early_stopping import spread
 from sagesplat.train.importance import importance
@@ -36,6 +37,7 @@ from sagesplat.train.lower_levels import (
     Set,
     assemble,
     first_of_all,
+    in_cells,
     joined,
     merged_rungs,
     split_sets,
@@ -83,7 +85,8 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
             levels.append(least)
         ladder = assemble([*sets, Set(ordered, tuple(levels))])
         coarse = sum(share <= _TRAINED for share in shares[:-1]) if config.fit == "renders" else 0
-        lines = _write(job, ladder, num_lower, coarse, g, settings, config.lossless)
+        ladder, label_of = in_cells(ladder, cells_wanted(len(ordered)))
+        lines = _write(job, ladder, label_of, num_lower, coarse, g, settings, config.lossless)
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -173,6 +176,7 @@ def _trained(
 def _write(
     job: Job,
     ladder: Assembled,
+    label_of: Mapping[int, int],
     num_lower: int,
     coarse: int,
     before: Gaussians,
@@ -188,7 +192,7 @@ def _write(
     run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
     g = ladder.gaussians.select(torch.from_numpy(packed(ladder.gaussians, ladder.sizes)))
     chunks = write_increments(
-        run.increments, g, ladder.sizes, job.names(), label_of={label: label for label in ladder.sizes},
+        run.increments, g, ladder.sizes, job.names(), label_of=label_of,
         replaces=ladder.replaces,
         kind=lambda _, level: "ply" if lossless and level > num_lower else "spz",
         fine=range(coarse + 1, levels + 1), antialiased=job.antialiased,
@@ -197,9 +201,9 @@ def _write(
     if not lossless and (other := sum(chunk.format != "spz" for chunk in chunks)):
         job.emit(Warned(f"{other} files are PLY: SPZ's steps of positions are larger than their Gaussians"))
     write_set(run.prefixes, sent, settings["steps"], ladder.sizes, replaces=ladder.replaces, exact=True)
-    write_cells(run.cells, describe_cells(sent, {label: label for label in ladder.sizes}))
+    write_cells(run.cells, describe_cells(sent, dict(label_of)))
     size, total = sum(chunk.nbytes for chunk in chunks), len(sent)
-    top = read_prefixes(run.prefixes).load(levels)
+    top = NestedLadder(read_prefixes(run.prefixes), dict(label_of)).load(levels)
     decibels = _loss(job, top, before)
     if decibels < _ROUNDED and not lossless:
         job.emit(Warned(f"SPZ rounds the last level to {decibels:.1f} dB; --lossless keeps it as it came in"))

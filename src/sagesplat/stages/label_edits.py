@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sagesplat.adapt.ladder import read_prefixes
+from sagesplat.adapt.regroup import NewCell
 from sagesplat.core.config import FitConfig, PlanConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import StageDone, StageStarted
@@ -39,8 +39,8 @@ _KEPT = (
     "masks", "fused", "labels.npz", "provenance",
 )  # fmt: skip
 _OF_LADDER = (
-    "ladder.npz", "increments", "observations.csv", "viewpoints.json", "fidelity.npz", "fidelity.json",
-    "models.json", "promises.json", "plan.json", "provenance",
+    "ladder.npz", "cells.npz", "increments", "observations.csv", "viewpoints.json", "fidelity.npz",
+    "fidelity.json", "models.json", "promises.json", "plan.json", "provenance",
 )  # fmt: skip
 _MEASURED = ("nest", "observe", "sample", "fit", "plan")  # stages in their order, each recorded again
 
@@ -92,8 +92,10 @@ def _checked(job: Job, edits: LabelEdits, path: Path) -> Relabelled:
         )
     if not edits.operations:
         raise LabelError(f"{path}: no operations; there is nothing to apply")
-    ladder = read_prefixes(job.run.prefixes)
-    counts = {label: sizes[-1] for label, sizes in ladder.sizes.items()}
+    ladder, label_of = job.by_cell, job.cells.label_of
+    counts = dict.fromkeys(sorted(label_of.values()), 0)
+    for cell, sizes in ladder.sizes.items():
+        counts[label_of[cell]] += sizes[-1]
     try:
         made = relabelled(
             {label: names[label] for label in counts}, counts, edits.operations,
@@ -167,8 +169,7 @@ def _keep_instances_alone(run: RunDir, new: RunDir) -> None:
 
 def _make(job: Job, new: Job, made: Relabelled) -> bool:
     """Levels, measurements, models and plan of the new categories; whether levels were rendered again."""
-    if made.changed:
-        move_levels(job, new, made)
+    cells: dict[int, NewCell] = move_levels(job, new, made) if made.changed else {}
     move_labels(job, new, made)
     _sign(new.run, "masks", [new.run.edited])
     known = recorded_settings(new.run)
@@ -178,10 +179,10 @@ def _make(job: Job, new: Job, made: Relabelled) -> bool:
             _sign(new.run, stage)
         return False
     _sign(new.run, "nest")
-    rendered = measure(job, new, made, fit)
+    rendered = measure(job, new, made, cells, fit)
     _sign(new.run, "observe")
     _sign(new.run, "sample")
-    refit(job, new, fit, made.changed)
+    refit(job, new, fit, made.changed, cells)
     _sign(new.run, "fit")
     plan: PlanConfig = known.get("plan", PlanConfig())
     make_plan(new, replace(plan, weights=made.weights if plan.budget else {}))

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,16 +11,23 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
-from sagesplat.adapt.fidelity import distances_at, write_sampled
-from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.cells import describe_cells, write_cells
+from sagesplat.adapt.fidelity import write_sampled
+from sagesplat.adapt.ladder import NestedLadder
 from sagesplat.adapt.observe import merge
-from sagesplat.adapt.regroup import regrouped, regrouped_observations, regrouped_samples
+from sagesplat.adapt.regroup import (
+    NewCell,
+    new_cells,
+    regrouped,
+    regrouped_observations,
+    regrouped_samples,
+)
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.increments import INDEX, Increment, read_index, write_index
-from sagesplat.formats.levels import read_header, write_set
+from sagesplat.formats.increments import read_index, write_index
+from sagesplat.formats.levels import read_header, read_level, write_set
 from sagesplat.formats.stream_header import SIZE, Grid, Header
 from sagesplat.formats.stream_header import read_header as read_stream_header
 from sagesplat.formats.stream_increments import read_streams, write_streams
@@ -34,35 +42,39 @@ from sagesplat.stages.sample import measured_levels
 from sagesplat.stages.shared import rendered_labels
 
 
-def move_levels(job: Job, new: Job, made: Relabelled) -> None:
-    """Write ladder and increments of the new categories; those that did not change keep their files."""
-    ladder = job.ladder
-    assert isinstance(ladder, PrefixLadder)
-    changed = sorted(made.changed)
-    g, sizes, second = regrouped(ladder, made.new_ids, changed)
+def move_levels(job: Job, new: Job, made: Relabelled) -> dict[int, NewCell]:
+    """Write ladder, cells and increments of the new categories; those that did not change keep their files.
+
+    Returns the new cells by id.
+    """
+    ladder, before = job.by_cell, job.ladder
+    assert isinstance(before, NestedLadder)
+    cells = new_cells(before, made.new_ids)
+    changed = {cell: one for cell, one in cells.items() if one.label_id in made.changed}
+    same = {cell: one for cell, one in cells.items() if cell not in changed}
+    g, sizes, second = regrouped(ladder, changed)
     folder = new.run.increments
-    kept = [one for one in read_index(folder) if one.label_id in made.names and one.label_id not in changed]
-    headers = _headers(job.run.increments)
-    grids = {
-        new: Grid.finest([headers[old] for old in sources if old in headers])
-        for new, sources in made.sources.items()
-        if new in changed
-    }
+    listed, numbers = read_index(folder), {one.old: cell for cell, one in same.items()}
+    kept = [replace(one, cell=numbers[one.cell]) for one in listed if one.cell in numbers]
+    headers = _headers(folder)
     with TemporaryDirectory(dir=new.run.adapted) as work:
+        streams = Path(work) / "streams"
         written = write_streams(
-            Path(work) / "streams", g, sizes, made.names, label_of={label: label for label in sizes},
-            second=second, antialiased=job.antialiased, grids=grids,
+            streams, g, sizes, made.names, label_of={cell: one.label_id for cell, one in changed.items()},
+            second=second, antialiased=job.antialiased,
+            grids={cell: Grid.of(headers[one.old]) for cell, one in changed.items()},
         )  # fmt: skip
-        decoded, seconds = read_streams(Path(work) / "streams", written.increments)
-        for one in {one.uri for one in read_index(folder)} - {one.uri for one in kept}:
-            (folder / one).unlink()
-        for one in {one.uri for one in written.increments}:
-            shutil.move(Path(work) / "streams" / one, folder / one)
-    write_index(
-        folder, sorted([*kept, *written.increments], key=lambda one: (one.label_id, one.cell, one.level))
-    )
-    _write_ladder(job, new, kept, (decoded, written.sizes, seconds))
-    assert (folder / INDEX).exists()
+        decoded, seconds = read_streams(streams, written.increments)
+        for uri in {one.uri for one in listed} - {one.uri for one in kept}:
+            (folder / uri).unlink()
+        for uri in {one.uri for one in written.increments}:
+            shutil.move(streams / uri, folder / uri)
+    write_index(folder, sorted([*kept, *written.increments], key=lambda one: (one.cell, one.level)))
+    # what is hardly to be seen is in no stream, and may be all of a cell
+    cells = {cell: one for cell, one in cells.items() if cell in same or cell in written.sizes}
+    _write_ladder(job, new, regrouped(ladder, same), (decoded, written.sizes, seconds))
+    _write_cells(job, new, cells)
+    return cells
 
 
 def _headers(folder: Path) -> dict[int, Header]:
@@ -76,28 +88,34 @@ def _headers(folder: Path) -> dict[int, Header]:
     return found
 
 
-def _write_ladder(
-    job: Job,
-    new: Job,
-    kept: list[Increment],
-    changed: tuple[Gaussians, dict[int, tuple[int, ...]], SecondOpacities | None],
-) -> None:
-    """Write ladder.npz: categories that did not change as they were, and the others as decoded."""
-    ladder = job.ladder
-    assert isinstance(ladder, PrefixLadder)
-    labels = sorted({one.label_id for one in kept})
-    rows = [slice(ladder.ranges[label][0][0], ladder.ranges[label][-1][1]) for label in labels]
-    g, sizes, second = changed
-    both = concat([ladder.gaussians.slices(rows), g])
+_Levels = tuple[Gaussians, dict[int, tuple[int, ...]], SecondOpacities | None]
+
+
+def _write_ladder(job: Job, new: Job, *parts: _Levels) -> None:
+    """Write ladder.npz: cells that did not change as they were, and the others as decoded."""
+    gaussians, sizes, seconds = zip(*parts, strict=True)
+    both = concat(gaussians)
     order = torch.argsort(both.label_ids, stable=True)
-    all_sizes = {**{label: ladder.sizes[label] for label in labels}, **sizes}
-    opacities = None
-    if ladder.second is not None and second is not None:
-        logits = torch.cat([*(ladder.second.logits[part] for part in rows), second.logits])
-        weights = {**{label: ladder.second.weights[label] for label in labels}, **second.weights}
-        opacities = SecondOpacities(logits[order], weights)
+    known, second = [one for one in seconds if one is not None], None
+    if known:
+        weights = {cell: of_levels for one in known for cell, of_levels in one.weights.items()}
+        second = SecondOpacities(torch.cat([one.logits for one in known])[order], weights)
+    all_sizes = {cell: of_levels for one in sizes for cell, of_levels in one.items()}
     step = read_header(job.run.prefixes).step
-    write_set(new.run.prefixes, both.select(order), step, all_sizes, second=opacities)
+    write_set(new.run.prefixes, both.select(order), step, dict(sorted(all_sizes.items())), second=second)
+
+
+def _write_cells(job: Job, new: Job, cells: Mapping[int, NewCell]) -> None:
+    """Write cells.npz: cells that are whole as they were."""
+    before, g = job.cells, read_level(new.run.prefixes)
+    kept = before.select(np.searchsorted(before.ids, [one.old for one in cells.values()]))
+    labels = {cell: one.label_id for cell, one in cells.items()}
+    parts = {cell: labels[cell] for cell, one in cells.items() if not one.whole}
+    if parts:
+        rows, found = np.flatnonzero([not one.whole for one in cells.values()]), describe_cells(g, parts)
+        for name in ("bounds", "grid", "area", "radius"):
+            getattr(kept, name)[rows] = getattr(found, name)
+    write_cells(new.run.cells, replace(kept, ids=np.array(list(labels)), labels=np.array([*labels.values()])))
 
 
 def move_labels(job: Job, new: Job, made: Relabelled) -> None:
@@ -161,7 +179,7 @@ def _nearest(painted: np.ndarray, mine: np.ndarray, parts: np.ndarray) -> np.nda
 def _move_points(job: Job, new: Job, made: Relabelled) -> None:
     """Points of a split category get the part of its nearest Gaussian."""
     ladder = job.ladder
-    assert isinstance(ladder, PrefixLadder)
+    assert isinstance(ladder, NestedLadder)
     points = job.scene.points.xyz
     lifted = LiftedLabels.read(job.point_label_file, len(points))
     ids = lifted.label_ids.copy()
@@ -170,14 +188,14 @@ def _move_points(job: Job, new: Job, made: Relabelled) -> None:
         if (moved := made.moved(old)) is not None:
             ids[mine] = moved
         elif mine.any():
-            first, last = ladder.ranges[old][0][0], ladder.ranges[old][-1][1]
-            means = ladder.gaussians.means[first:last].numpy()
+            cells = [ladder.cells.ranges[cell] for cell in ladder.cells_of(old)]
+            means = ladder.cells.gaussians.slices([slice(of[0][0], of[-1][1]) for of in cells]).means.numpy()
             ids[mine] = new_ids[KDTree(means).query(points[mine])[1]]
     LiftedLabels(ids, lifted.num_votes, lifted.num_agreeing, lifted.ignored).write(new.run.labels)
 
 
-def measure(job: Job, new: Job, made: Relabelled, fit: FitConfig) -> bool:
-    """Write observations and samples: of merged categories from those of their parts, of parts by rendering.
+def measure(job: Job, new: Job, made: Relabelled, cells: Mapping[int, NewCell], fit: FitConfig) -> bool:
+    """Write observations and samples: of what was merged from those of its parts, of parts by rendering.
 
     With all categories at one level images are those of before, so what did not change is not measured again.
     Returns whether anything was rendered.
@@ -186,14 +204,12 @@ def measure(job: Job, new: Job, made: Relabelled, fit: FitConfig) -> bool:
     moved = {old: None if (to := made.moved(old)) in fresh else to for old in made.new_ids}
     if new.run.observations.exists():
         _observe(job, new, fit, moved, fresh)
-    drawn, labels = viewpoints_of(job), sorted(made.names)
-    cameras = [drawn.cameras[row] for row in drawn.rows("fit")]
-    far = distances_at(job.scene, new.point_labels, cameras, labels, fit.distance)
-    sampled = regrouped_samples(sampled_of(job), moved, far, labels)
-    if fresh:
-        found, columns = measured_levels(new, cameras, fit, fresh), [labels.index(one) for one in fresh]
-        sampled.fidelity[:, columns] = found.fidelity[:, columns]
-        sampled.pixels[:, columns] = found.pixels[:, columns]
+    sampled = regrouped_samples(sampled_of(job), cells)
+    if parts := [cell for cell, one in cells.items() if not one.whole]:
+        drawn, columns = viewpoints_of(job), [sampled.labels.index(cell) for cell in parts]
+        found = measured_levels(new, [drawn.cameras[row] for row in drawn.rows("fit")], parts)
+        for name in ("fidelity", "pixels", "distance"):
+            getattr(sampled, name)[:, columns] = getattr(found, name)[:, columns]
     write_sampled(new.run.sampled, sampled)
     return bool(fresh)
 

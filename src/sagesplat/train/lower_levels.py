@@ -6,12 +6,14 @@ originals, ordered by importance; the last level is all of them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 
 from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.train.cells import split_cells
 from sagesplat.train.merging import merge
 from sagesplat.train.nested import Nested, Spans
 
@@ -134,6 +136,57 @@ def assemble(sets: Sequence[Set]) -> Assembled:
             parts.append(one.gaussians.select(torch.from_numpy(mine[label])))
         sizes[label], replaces[label] = tuple(ends), tuple(replacing)
     return Assembled(concat(parts), sizes, replaces)
+
+
+def in_cells(ladder: Assembled, count: int) -> tuple[Assembled, dict[int, int]]:
+    """The ladder in about `count` cells, by whose ids its rows then are, and the label id of each.
+
+    The originals are split by place, and what stands for them goes with the nearest one. Every cell has
+    Gaussians at every level, so that each set replaces the one before: a category that is too small is one
+    cell. With all cells at one level the Gaussians are those of before.
+    """
+    g, rows_of = ladder.gaussians, by_label(ladder.gaussians)
+    last = {label: max((1, *ladder.replaces[label])) - 1 for label in rows_of}  # where the originals begin
+    begins = {label: ladder.sizes[label][level - 1] if level else 0 for label, level in last.items()}
+    originals = np.concatenate([rows[begins[label] :] for label, rows in rows_of.items()])
+    means, labels = g.means.numpy(), g.label_ids.numpy()
+    split, _ = split_cells(means[originals], labels[originals], count)
+    order, ids, found = [], [], Assembled(g, {}, {})
+    label_of = dict[int, int]()
+    for label, rows in rows_of.items():
+        mine = split[labels[originals] == label]
+        nearest = KDTree(means[rows[begins[label] :]]).query(means[rows])[1]
+        nearest[begins[label] :] = np.arange(len(mine))
+        _, own = np.unique(mine[nearest], return_inverse=True)
+        sizes, replaces = ladder.sizes[label], ladder.replaces[label]
+        starts = [0, *(sizes[level - 2] for level in replaces)]
+        firsts = [sizes[0], *(sizes[level - 1] for level in replaces)]
+        for start, end in zip(starts, firsts, strict=True):
+            if not _all_present(own[start:end], means[rows[start:end]], own, means[rows]):
+                own = np.zeros_like(own)
+                break
+        for part in range(int(own.max()) + 1):
+            ranks, cell = np.flatnonzero(own == part), len(label_of)
+            order.append(rows[ranks])
+            ids.append(np.full(len(ranks), cell, np.int16))
+            found.sizes[cell] = tuple(np.searchsorted(ranks, sizes).tolist())
+            found.replaces[cell], label_of[cell] = replaces, label
+    g = g.select(torch.from_numpy(np.concatenate(order)))
+    return replace(found, gaussians=replace(g, label_ids=torch.from_numpy(np.concatenate(ids)))), label_of
+
+
+def _all_present(level: np.ndarray, means: np.ndarray, own: np.ndarray, everywhere: np.ndarray) -> bool:
+    """Give each cell that is not in `level` (cells, changed in place) the nearest that others can spare."""
+    counts = np.bincount(level, minlength=int(own.max()) + 1)
+    if len(level) < len(counts):
+        return False
+    for cell in np.flatnonzero(counts == 0):
+        centre = everywhere[own == cell].mean(0)
+        spare = np.flatnonzero(counts[level] > 1)
+        one = spare[((means[spare] - centre) ** 2).sum(1).argmin()]
+        counts[level[one]] -= 1
+        counts[cell], level[one] = 1, cell
+    return True
 
 
 def split_sets(g: Gaussians, sets: Sequence[Set]) -> list[Set]:
