@@ -1,24 +1,31 @@
-/** Plans the level of each label from settings and a viewpoint. Levels are 1-based, 0 is nothing. */
+/** Plans the level of each cell from settings and a viewpoint. Levels are 1-based, 0 is nothing. */
 
-import type { Budget, Label, Settings } from "../types";
-import { type Allocation, bestWithin, cheapest } from "./allocate";
+import type { Budget, Level, Settings } from "../types";
+import { cheapest, known, together } from "./allocate";
 import { fill } from "./fill";
+import { hull, type Segment, steepest } from "./hull";
 
-/** The planner's input for one label. */
+/** The planner's input for a cell, or for a label all of whose cells have one level. */
 export interface Candidate {
-  readonly label: Label;
-  readonly always?: boolean; // instead of the label\'s
   readonly ladder: Ladder;
   readonly highest: number; // highest available level; lower if an increment is damaged
   readonly mean: readonly number[]; // by level, quality; NaN: unknown
-  readonly bound: readonly number[];
   readonly weight: number; // of the label, set by the user
-  readonly share: number; // pixel share; out of sight the one that it would have
+  readonly always: boolean; // in full
+  readonly share: number; // pixel share; 0: out of sight
+  readonly potential: number; // apparent size if all of it were in sight
   readonly visible: boolean;
   readonly previous: number; // level in the previous plan, 0: none
 }
 
-/** Total costs of a label's levels. */
+/** The cells of a label, and what it takes to reach the target. */
+export interface Group {
+  readonly cells: readonly Candidate[];
+  readonly needed: number; // mean quality over its pixels; NaN: no promise is possible
+  readonly bound?: readonly number[]; // by level, of a label that is planned as a whole; instead of `needed`
+}
+
+/** Total costs of the levels of a cell. */
 export interface Ladder {
   readonly bytes: readonly number[];
   readonly gpuBytes: readonly number[];
@@ -26,20 +33,21 @@ export interface Ladder {
 }
 
 export interface Plan {
-  readonly wanted: readonly number[]; // level per candidate
+  readonly wanted: readonly (readonly number[])[]; // level by group and cell
+  readonly around: readonly (readonly number[])[]; // that which follows once everything in sight is drawn
   readonly status: "ok" | "infeasible" | "over budget";
 }
 
 const UNITS = ["bytes", "gpuBytes", "count"] as const;
 type Unit = (typeof UNITS)[number];
-const BUDGET_STEPS = 2 ** 20; // steps of a budget when several units are combined
-const LEAST_SHARE = 1e-4; // least pixel share, so that every visible label counts
+const LEAST_SHARE = 1e-4; // least pixel share, so that every visible cell counts
+const SLACK = 0.01; // least gain of quality for which a budget's levels are left
 
 /** Costs of levels as sums over their increments, from the newest that replaces those below. */
-export function ladderOf(label: Label): Ladder {
+export function ladderOf({ levels }: { readonly levels: readonly Level[] }): Ladder {
   const sums = (unit: Unit) => {
     let sum = 0;
-    return label.levels.map((level) => {
+    return levels.map((level) => {
       sum = level[unit] + (level.refine ? 0 : sum);
       return sum;
     });
@@ -47,42 +55,41 @@ export function ladderOf(label: Label): Ladder {
   return { bytes: sums("bytes"), gpuBytes: sums("gpuBytes"), count: sums("count") };
 }
 
-/** Weight of a label at this viewpoint. */
-export const visibleWeight = (c: Candidate): number => (c.visible ? potentialWeight(c) : 0);
+/** Weight of a cell at this viewpoint. */
+export const visibleWeight = (c: Candidate): number =>
+  c.visible ? c.weight * Math.max(c.share, LEAST_SHARE) : 0;
 
-/** The same, as if the label were in sight. */
-export const potentialWeight = (c: Candidate): number => c.weight * Math.max(c.share, LEAST_SHARE);
+/** The same, as if the cell were in sight. */
+export const potentialWeight = (c: Candidate): number => c.weight * Math.max(c.potential, LEAST_SHARE);
 
-const isAlways = (c: Candidate): boolean => c.always ?? c.label.always;
+/** Levels, from 0. */
+type Levels = Map<Candidate, number>;
 
 /** The planned levels, within the budget in all units; the smallest composition if nothing fits. */
-export function makePlan(candidates: readonly Candidate[], settings: Settings): Plan {
-  const there = withoutFar(
-    candidates.filter((c) => c.highest > 0),
+export function makePlan(groups: readonly Group[], settings: Settings): Plan {
+  const there = withoutUnseen(
+    groups.flatMap(({ cells }) => cells.filter((c) => c.highest > 0)),
     settings.budget,
   );
-  const fixed = there.filter((c) => isAlways(c));
-  const free = there.filter((c) => !isAlways(c));
-  const left = lessen(settings.budget, fixed);
-  const found = free.length ? choose(free, settings, left) : { levels: [], status: statusOf(left) };
-  const levels = new Map(free.map((c, i) => [c, (found.levels[i] ?? 0) + 1]));
-  for (const c of fixed) levels.set(c, c.highest);
-  return { wanted: candidates.map((c) => levels.get(c) ?? 0), status: found.status };
+  const fixed = there.filter((c) => c.always);
+  const free = there.filter((c) => !c.always);
+  const left = lessen(settings.budget, fixed, (c) => c.highest - 1);
+  const levels: Levels = new Map(free.map((c) => [c, 0]));
+  const status = choose(groups, levels, settings, left);
+  const around = raised(levels, settings, left);
+  for (const c of fixed) for (const all of [levels, around]) all.set(c, c.highest - 1);
+  const listed = (all: Levels) => groups.map(({ cells }) => cells.map((c) => (all.get(c) ?? -1) + 1));
+  return { wanted: listed(levels), around: listed(around), status };
 }
 
-/**
- * Removes per-block categories out of sight that do not fit even at their first level, least weight first.
- * Labels in sight stay, as do all labels of a scene without blocks.
- */
-function withoutFar(all: readonly Candidate[], budget: Budget): readonly Candidate[] {
-  const least = (c: Candidate) => (isAlways(c) ? c.highest : 1) - 1;
-  const over = { ...budget };
-  for (const unit of UNITS) for (const c of all) over[unit] -= c.ladder[unit][least(c)] ?? 0;
+/** Leaves out cells out of sight where not even the lowest levels fit, those of least apparent size first. */
+function withoutUnseen(all: readonly Candidate[], budget: Budget): readonly Candidate[] {
+  const over = { ...lessen(budget, all, (c) => (c.always ? c.highest - 1 : 0)) };
   const lacks = () => UNITS.some((unit) => over[unit] < 0);
   if (!lacks()) return all;
-  const far = all.filter((c) => c.label.block !== undefined && !c.visible && !isAlways(c));
   const out = new Set<Candidate>();
-  for (const c of far.sort((a, b) => potentialWeight(a) - potentialWeight(b))) {
+  const unseen = all.filter((c) => !c.visible && !c.always);
+  for (const c of unseen.sort((a, b) => potentialWeight(a) - potentialWeight(b))) {
     if (!lacks()) break;
     out.add(c);
     for (const unit of UNITS) over[unit] += c.ladder[unit][0] ?? 0;
@@ -90,110 +97,156 @@ function withoutFar(all: readonly Candidate[], budget: Budget): readonly Candida
   return all.filter((c) => !out.has(c));
 }
 
-interface Chosen {
-  readonly levels: readonly number[]; // from 0
-  readonly status: Plan["status"];
-}
-
-function choose(free: readonly Candidate[], settings: Settings, budget: Budget): Chosen {
-  if (settings.mode === "budget") return within(free, budget);
-  const asked = settings.mode === "target" ? reach(free, settings) : same(free, settings.mode);
-  if (fits(free, asked.levels, budget)) return asked;
-  const { levels, status } = within(free, budget);
-  return { levels, status: status === "ok" ? "infeasible" : status };
-}
-
-function same(free: readonly Candidate[], mode: "full" | "base"): Chosen {
-  return { levels: free.map((c) => (mode === "full" ? c.highest - 1 : 0)), status: "ok" };
+/** Raises the levels, which are the lowest, by the settings. */
+function choose(
+  groups: readonly Group[],
+  levels: Levels,
+  settings: Settings,
+  budget: Budget,
+): Plan["status"] {
+  const { mode } = settings;
+  if (mode === "budget") return within(levels, budget);
+  const asked = mode === "target" ? reach(groups, levels, settings) : "ok";
+  if (mode === "full") for (const c of levels.keys()) levels.set(c, c.highest - 1);
+  if (fits(levels, budget)) return asked;
+  for (const c of levels.keys()) levels.set(c, 0);
+  const status = within(levels, budget);
+  return status === "ok" ? "infeasible" : status;
 }
 
 /**
  * The cheapest levels that reach a target; the first level out of sight. For a target of fidelity the picture
- * as a whole is not to be worse than equal levels of all categories would be for the same bytes.
+ * as a whole is not to be worse than equal levels of all cells would be for the same bytes.
  */
-function reach(free: readonly Candidate[], { quality, target }: Settings): Chosen {
-  const levels = free.map(() => 0);
-  const seen = free.flatMap((c, i) => (c.visible && c.weight > 0 ? [{ c, i }] : []));
-  if (!seen.length) return { levels, status: "ok" };
-  const bounds = seen.map(({ c }) => c.bound);
-  const costs = seen.map(({ c }) => costOf(c, "bytes"));
-  const found = cheapest(bounds, costs, target, { previous: seen.map(({ c }) => before(c)) });
-  const weights = seen.map(({ c }) => visibleWeight(c));
-  const filled =
-    quality === "fidelity"
-      ? fill(
-          found.levels,
-          seen.map(({ c }) => c.mean),
-          costs,
-          weights,
-        )
-      : found.levels;
-  seen.forEach(({ i }, row) => {
-    levels[i] = filled[row] ?? 0;
-  });
-  return { levels, status: found.status };
-}
-
-/** The levels with the largest expected quality within the budget in every unit. */
-function within(free: readonly Candidate[], budget: Budget): Chosen {
-  const [tightest, ...others] = [...UNITS].sort((a, b) => room(free, budget, a) - room(free, budget, b));
-  const first = best(free, (c) => costOf(c, tightest as Unit), budget[tightest as Unit]);
-  if (first.status === "over budget" || others.every((unit) => fitsIn(free, first.levels, budget, unit))) {
-    return first;
+function reach(groups: readonly Group[], levels: Levels, { quality, target }: Settings): Plan["status"] {
+  let status: Plan["status"] = "ok";
+  const seen: Candidate[] = [];
+  for (const { cells, needed, bound } of groups) {
+    const mine = cells.filter((c) => levels.has(c) && c.visible && c.weight > 0);
+    if (!mine.length) continue;
+    seen.push(...mine);
+    const cost = mine.map((c) => costOf(c, "bytes"));
+    const previous = mine.map(before);
+    const isKnown = bound || (!Number.isNaN(needed) && mine.every(({ mean }) => !mean.every(Number.isNaN)));
+    const found = bound
+      ? cheapest([bound.slice(0, mine[0]?.highest)], cost, target, { previous })
+      : together(
+          { cost, mean: mine.map(qualityOf), share: mine.map(({ share }) => share), previous },
+          isKnown ? needed : 1,
+        );
+    if (found.status !== "ok") status = "infeasible";
+    mine.forEach((c, i) => {
+      levels.set(c, found.levels[i] ?? 0);
+    });
   }
-  // the largest share over all budgets, as the cost, respects each of them
-  const largest = (c: Candidate, k: number) =>
-    Math.max(...UNITS.map((unit) => (costOf(c, unit)[k] as number) / budget[unit] || 0));
-  const joint = best(
-    free,
-    (c) => c.label.levels.map((_, k) => Math.ceil(BUDGET_STEPS * largest(c, k))),
-    BUDGET_STEPS,
+  if (quality !== "fidelity") return status;
+  const filled = fill(
+    seen.map((c) => levels.get(c) ?? 0),
+    seen.map((c) => c.mean),
+    seen.map((c) => costOf(c, "bytes")),
+    seen.map(visibleWeight),
   );
-  return { levels: joint.levels, status: fits(free, joint.levels, budget) ? "ok" : "over budget" };
+  seen.forEach((c, i) => {
+    levels.set(c, filled[i] ?? 0);
+  });
+  return status;
 }
 
-function best(
-  free: readonly Candidate[],
-  cost: (c: Candidate) => readonly number[],
-  budget: number,
-): Allocation {
-  return bestWithin(
-    free.map((c) => c.mean),
-    free.map(cost),
-    free.map(visibleWeight),
-    Math.max(budget, 0),
-    { previous: free.map(before) },
-  );
+/**
+ * Upgrades by falling gain per cost, each taken if it still fits in every unit. The cost is the largest part of
+ * the budgets.
+ */
+function within(levels: Levels, budget: Budget): Plan["status"] {
+  if (!fits(levels, budget)) return "over budget";
+  const cells = [...levels.keys()];
+  const values = cells.map((c) => qualityOf(c).map((quality) => visibleWeight(c) * quality));
+  const part = (c: Candidate, k: number) =>
+    Math.max(...UNITS.map((unit) => (c.ladder[unit][k] as number) / budget[unit] || 0));
+  const segments = cells.flatMap((c, i) => {
+    const value = values[i] ?? [];
+    return value.at(-1) === 0
+      ? []
+      : hull(
+          value.map((_, k) => part(c, k)),
+          value,
+          0,
+          i,
+        );
+  });
+  takeFitting(cells, levels, steepest(segments), lessen(budget, cells, () => 0));
+  const value = (of: (c: Candidate) => number) =>
+    cells.reduce((sum, c, i) => sum + (values[i]?.[of(c)] ?? 0), 0);
+  // levels in sight that are about as good stay
+  const earlier: Levels = new Map(cells.map((c) => [c, c.visible && c.weight > 0 ? before(c) : 0]));
+  const weight = cells.reduce((sum, c) => sum + visibleWeight(c), 0);
+  const stays =
+    cells.every((c) => (earlier.get(c) ?? -1) >= 0) &&
+    fits(earlier, budget) &&
+    value((c) => earlier.get(c) ?? 0) >= value((c) => levels.get(c) ?? 0) - SLACK * weight;
+  if (stays) for (const [c, level] of earlier) levels.set(c, level);
+  return "ok";
+}
+
+/** Takes each segment that continues its cell's level and fits into what is left, which it lessens. */
+function takeFitting(
+  cells: readonly Candidate[],
+  levels: Levels,
+  segments: readonly Segment[],
+  left: Record<Unit, number>,
+): void {
+  for (const { row, from, to } of segments) {
+    const c = cells[row] as Candidate;
+    if (levels.get(c) !== from) continue;
+    const more = (unit: Unit) => (c.ladder[unit][to] as number) - (c.ladder[unit][from] as number);
+    if (!UNITS.every((unit) => more(unit) <= left[unit])) continue;
+    for (const unit of UNITS) left[unit] -= more(unit);
+    levels.set(c, to);
+  }
+}
+
+/** The levels with cells out of sight raised, the largest first, by a segment at a time. */
+function raised(levels: Levels, { mode, aroundBytes }: Settings, budget: Budget): Levels {
+  const around: Levels = new Map(levels);
+  const left = lessen(budget, [...levels.keys()], (c) => levels.get(c) ?? 0);
+  if (mode === "full" || mode === "base" || UNITS.some((unit) => left[unit] < 0)) return around;
+  const cells = [...levels.keys()]
+    .filter((c) => !c.visible && c.weight > 0)
+    .sort((a, b) => b.potential - a.potential);
+  const steps = cells.map((c, i) => hull(costOf(c, "bytes"), qualityOf(c), levels.get(c), i));
+  const rounds = Math.max(0, ...steps.map(({ length }) => length));
+  const inTurn = Array.from({ length: rounds }, (_, round) => steps.flatMap((own) => own[round] ?? []));
+  takeFitting(cells, around, inTurn.flat(), { ...left, bytes: Math.min(left.bytes, aroundBytes) });
+  return around;
+}
+
+/** Expected quality by available level: an unknown one as the one below, by the bytes if all are. */
+function qualityOf({ mean, ladder, highest }: Candidate): number[] {
+  const cost = ladder.bytes.slice(0, highest);
+  const { q, promised } = known([mean.slice(0, highest)], [cost]);
+  let last = 0;
+  return (q[0] ?? []).map((quality, k) => {
+    if (!promised[0] || !Number.isNaN(mean[k])) last = quality;
+    return last;
+  });
 }
 
 const before = (c: Candidate): number => (c.previous <= c.highest ? c.previous - 1 : -1);
 
-/** Cost by level; Infinity for unavailable levels. */
-const costOf = (c: Candidate, unit: Unit): readonly number[] =>
-  c.ladder[unit].map((cost, k) => (k < c.highest ? cost : Infinity));
+/** Cost by available level. */
+const costOf = (c: Candidate, unit: Unit): readonly number[] => c.ladder[unit].slice(0, c.highest);
 
-/** Budget as a share of the full model's cost. */
-function room(free: readonly Candidate[], budget: Budget, unit: Unit): number {
-  const full = free.reduce((sum, c) => sum + (c.ladder[unit][c.highest - 1] ?? 0), 0);
-  return full > 0 ? budget[unit] / full : Infinity;
+const fits = (levels: Levels, budget: Budget): boolean => {
+  const left = lessen(budget, [...levels.keys()], (c) => levels.get(c) ?? 0);
+  return UNITS.every((unit) => left[unit] >= 0);
+};
+
+/** A budget less what cells cost at a level, from 0. */
+function lessen(
+  budget: Budget,
+  cells: readonly Candidate[],
+  level: (c: Candidate) => number,
+): Record<Unit, number> {
+  const left = { ...budget };
+  for (const c of cells) for (const unit of UNITS) left[unit] -= c.ladder[unit][level(c)] ?? 0;
+  return left;
 }
-
-const fits = (free: readonly Candidate[], levels: readonly number[], budget: Budget): boolean =>
-  UNITS.every((unit) => fitsIn(free, levels, budget, unit));
-
-function fitsIn(free: readonly Candidate[], levels: readonly number[], budget: Budget, unit: Unit): boolean {
-  const cost = free.reduce((sum, c, i) => sum + (c.ladder[unit][levels[i] ?? 0] ?? 0), 0);
-  return cost <= budget[unit];
-}
-
-function lessen(budget: Budget, fixed: readonly Candidate[]): Budget {
-  const cost = (unit: Unit) => fixed.reduce((sum, c) => sum + (c.ladder[unit][c.highest - 1] ?? 0), 0);
-  return {
-    bytes: budget.bytes - cost("bytes"),
-    gpuBytes: budget.gpuBytes - cost("gpuBytes"),
-    count: budget.count - cost("count"),
-  };
-}
-
-const statusOf = (left: Budget): Plan["status"] =>
-  UNITS.every((unit) => left[unit] >= 0) ? "ok" : "over budget";
