@@ -5,7 +5,7 @@ import { type Source, sourceInside } from "./inside";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
 import { openViewer } from "./view/open";
-import { colorsOf } from "./view/spark";
+import { colorsOf } from "./view/colors";
 import { embed, type Viewer } from "./view/viewer";
 
 declare global {
