@@ -102,7 +102,8 @@ export interface CellState {
 export interface LabelState {
   readonly label: Label;
   readonly cells: readonly CellState[];
-  readonly wanted: number; // share of the splats planned, of those that its cells in sight have, or else all
+  readonly splats: number; // in full, of its cells in sight, or else of all
+  readonly wanted: number; // share of these that is planned
   readonly shown: number; // the same of those drawn
   readonly loading: boolean;
   readonly error: string | null;

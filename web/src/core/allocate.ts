@@ -78,7 +78,9 @@ export function together(cells: Cells, needed: number): { levels: number[]; stat
     const best = mean.map((row) => Math.max(0, row.indexOf(Math.max(...row))));
     return { levels: best, status: "infeasible" };
   }
-  const before = previous?.every((level, i) => level >= 0 && level < (cost[i]?.length ?? 0)) ? previous : null;
+  const before = previous?.every((level, i) => level >= 0 && level < (cost[i]?.length ?? 0))
+    ? previous
+    : null;
   const holds =
     before &&
     total(value, before) >= goal &&

@@ -57,6 +57,7 @@ function labelState({ label, entries, outlook }: Family, overview: Overview): La
     cells: entries.map(({ cell, wanted, sight }, i) => {
       return { cell, wanted, shown: drawn[i]?.level ?? 0, visible: sight.visible };
     }),
+    splats: whole,
     wanted: part(({ wanted }) => wanted),
     shown: part(({ shown }) => shown),
     loading: entries.some(({ shown, wanted }) => shown < wanted),
@@ -100,7 +101,8 @@ export function leastPromise(labels: readonly LabelState[]): number {
 }
 
 function errorOf(entry: Entry, overview: Overview): string | null {
-  const { title } = entry.label;
+  const { title: name, cells } = entry.label;
+  const title = cells.length > 1 ? `a part of ${name}` : name;
   const { levels } = entry.cell;
   for (let level = 1; level <= levels.length; level++) {
     const failure = overview.failure(entry, level);

@@ -133,7 +133,12 @@ export function pick(clouds: readonly Packed[], encoding: Encoding, ray: Ray): P
 }
 
 /** Adds the splats of a label that a ray meets. */
-function meet({ label, first = 0, words, count, hidden }: Packed, scales: Float64Array, ray: Ray, hits: Hit[]): void {
+function meet(
+  { label, first = 0, words, count, hidden }: Packed,
+  scales: Float64Array,
+  ray: Ray,
+  hits: Hit[],
+): void {
   const [ox, oy, oz] = ray.origin;
   const [dx, dy, dz] = ray.direction;
   const [fx, fy, fz] = ray.forward;

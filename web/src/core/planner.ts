@@ -173,7 +173,12 @@ function within(levels: Levels, budget: Budget): Plan["status"] {
           i,
         );
   });
-  takeFitting(cells, levels, steepest(segments), lessen(budget, cells, () => 0));
+  takeFitting(
+    cells,
+    levels,
+    steepest(segments),
+    lessen(budget, cells, () => 0),
+  );
   const value = (of: (c: Candidate) => number) =>
     cells.reduce((sum, c, i) => sum + (values[i]?.[of(c)] ?? 0), 0);
   // levels in sight that are about as good stay

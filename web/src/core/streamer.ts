@@ -315,14 +315,7 @@ export class Streamer {
     let handle: Handle | undefined;
     try {
       const { label, cell } = entry;
-      handle = await this.renderer.decode(
-        label.id,
-        cell.id,
-        level,
-        content,
-        file.format,
-        entry.below(level),
-      );
+      handle = await this.renderer.decode(label.id, cell.id, level, content, file.format, entry.below(level));
       if (file.format === "stream") entry.contents[level - 1] = content;
     } catch {
       this.downloads.markCorrupt(file, `${file.uri} cannot be decoded`);

@@ -43,7 +43,8 @@ export function boundsOf(words: Uint32Array, count: number, encoding: Encoding):
   const high = [-Infinity, -Infinity, -Infinity];
   for (let at = 0; at < 4 * count; at += 4) {
     const [xy, z, sizes] = [words[at + 1] as number, words[at + 2] as number, words[at + 3] as number];
-    const reach = REACH * (scales[Math.max(sizes & 255, (sizes >>> 8) & 255, (sizes >>> 16) & 255)] as number);
+    const reach =
+      REACH * (scales[Math.max(sizes & 255, (sizes >>> 8) & 255, (sizes >>> 16) & 255)] as number);
     const place = [half(xy), half(xy >>> 16), half(z)];
     for (let axis = 0; axis < 3; axis++) {
       const centre = place[axis] as number;

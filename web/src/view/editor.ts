@@ -300,7 +300,7 @@ export class Editor {
       if (full !== label.always) always.set(id, full);
       const marks = this.marksOf(id, numbers);
       for (const { cell, first } of placed(label)) {
-        viewer.stage.layer.setMarks(cell.id, marks && marks.slice(first, first + countOf(cell)));
+        viewer.stage.layer.setMarks(cell.id, marks?.slice(first, first + countOf(cell)) ?? null);
       }
     }
     viewer.set({ weights, always });
