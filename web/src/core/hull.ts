@@ -11,25 +11,36 @@ export interface Segment {
 }
 
 /**
- * The segments of the upper concave hull of value over cost, from a level on. Of equal slopes the one of less
- * cost, then of more gain, then the lower level.
+ * The step of most gain per cost from a level; null: none gains. Of equal slopes the one of less cost, then of more
+ * gain, then the lower level.
  */
+export function nextSegment(
+  cost: readonly number[],
+  value: readonly number[],
+  from: number,
+  row = 0,
+): Segment | null {
+  const [paid, had] = [cost[from] as number, value[from] as number];
+  let [best, slope, more, gain] = [-1, 0, 0, 0];
+  for (let to = from + 1; to < cost.length; to++) {
+    const gained = (value[to] as number) - had;
+    if (!(gained > 0)) continue;
+    const costs = (cost[to] as number) - paid;
+    const steep = costs > 0 ? gained / costs : Infinity;
+    if (steep < slope) continue;
+    if (steep > slope || (steep === slope && (costs < more || (costs === more && gained > gain)))) {
+      [best, slope, more, gain] = [to, steep, costs, gained];
+    }
+  }
+  return best < 0 ? null : { row, from, to: best, slope, more, gain };
+}
+
+/** The segments of the upper concave hull of value over cost, from a level on. */
 export function hull(cost: readonly number[], value: readonly number[], from = 0, row = 0): Segment[] {
   const found: Segment[] = [];
-  for (let level = from; level >= 0; ) {
-    let best: Segment = { row, from: level, to: -1, slope: 0, more: 0, gain: 0 };
-    for (let to = level + 1; to < cost.length; to++) {
-      const more = (cost[to] as number) - (cost[level] as number);
-      const gain = (value[to] as number) - (value[level] as number);
-      if (!(gain > 0)) continue;
-      const slope = more > 0 ? gain / more : Infinity;
-      const better = more < best.more || (more === best.more && gain > best.gain);
-      if (slope > best.slope || (slope === best.slope && better)) {
-        best = { row, from: level, to, slope, more, gain };
-      }
-    }
-    if (best.to >= 0) found.push(best);
-    level = best.to;
+  for (let next = nextSegment(cost, value, from, row); next; ) {
+    found.push(next);
+    next = nextSegment(cost, value, next.to, row);
   }
   return found;
 }

@@ -1,9 +1,9 @@
 /** Plans the level of each cell from settings and a viewpoint. Levels are 1-based, 0 is nothing. */
 
 import type { Budget, Level, Settings } from "../types";
-import { cheapest, known, together } from "./allocate";
+import { cheapest, together } from "./allocate";
 import { fill } from "./fill";
-import { hull, type Segment, steepest } from "./hull";
+import { hull, nextSegment, type Segment, steepest } from "./hull";
 
 /** The planner's input for a cell, or for a label all of whose cells have one level. */
 export interface Candidate {
@@ -62,55 +62,58 @@ export const visibleWeight = (c: Candidate): number =>
 /** The same, as if the cell were in sight. */
 export const potentialWeight = (c: Candidate): number => c.weight * Math.max(c.potential, LEAST_SHARE);
 
-/** Levels, from 0. */
-type Levels = Map<Candidate, number>;
+/** A cell while it is planned. */
+interface Row {
+  readonly c: Candidate;
+  level: number; // from 0; -1: left out
+}
 
 /** The planned levels, within the budget in all units; the smallest composition if nothing fits. */
 export function makePlan(groups: readonly Group[], settings: Settings): Plan {
-  const there = withoutUnseen(
-    groups.flatMap(({ cells }) => cells.filter((c) => c.highest > 0)),
-    settings.budget,
+  const all = groups.map(({ cells }) =>
+    cells.map((c): Row => ({ c, level: c.highest > 0 ? (c.always ? c.highest - 1 : 0) : -1 })),
   );
-  const fixed = there.filter((c) => c.always);
-  const free = there.filter((c) => !c.always);
-  const left = lessen(settings.budget, fixed, (c) => c.highest - 1);
-  const levels: Levels = new Map(free.map((c) => [c, 0]));
-  const status = choose(groups, levels, settings, left);
-  const around = raised(levels, settings, left);
-  for (const c of fixed) for (const all of [levels, around]) all.set(c, c.highest - 1);
-  const listed = (all: Levels) => groups.map(({ cells }) => cells.map((c) => (all.get(c) ?? -1) + 1));
-  return { wanted: listed(levels), around: listed(around), status };
+  leaveOut(all.flat(), settings.budget);
+  const there = all.flat().filter(({ level }) => level >= 0);
+  const free = there.filter(({ c }) => !c.always);
+  const left = lessen(
+    settings.budget,
+    there.filter(({ c }) => c.always),
+  );
+  const status = choose(groups, all, free, settings, left);
+  const listed = () => all.map((rows) => rows.map(({ level }) => level + 1));
+  const wanted = listed();
+  raise(free, settings, left);
+  return { wanted, around: listed(), status };
 }
 
 /** Leaves out cells out of sight where not even the lowest levels fit, those of least apparent size first. */
-function withoutUnseen(all: readonly Candidate[], budget: Budget): readonly Candidate[] {
-  const over = { ...lessen(budget, all, (c) => (c.always ? c.highest - 1 : 0)) };
-  const lacks = () => UNITS.some((unit) => over[unit] < 0);
-  if (!lacks()) return all;
-  const out = new Set<Candidate>();
-  const unseen = all.filter((c) => !c.visible && !c.always);
-  for (const c of unseen.sort((a, b) => potentialWeight(a) - potentialWeight(b))) {
-    if (!lacks()) break;
-    out.add(c);
-    for (const unit of UNITS) over[unit] += c.ladder[unit][0] ?? 0;
+function leaveOut(rows: readonly Row[], budget: Budget): void {
+  const over = lessen(budget, rows);
+  if (!isOver(over)) return;
+  const unseen = rows.filter(({ c, level }) => level >= 0 && !c.visible && !c.always);
+  for (const row of unseen.sort((a, b) => potentialWeight(a.c) - potentialWeight(b.c))) {
+    if (!isOver(over)) return;
+    for (const unit of UNITS) over[unit] += row.c.ladder[unit][0] ?? 0;
+    row.level = -1;
   }
-  return all.filter((c) => !out.has(c));
 }
 
-/** Raises the levels, which are the lowest, by the settings. */
+/** Raises the levels of the free rows, which are the lowest, by the settings. */
 function choose(
   groups: readonly Group[],
-  levels: Levels,
+  all: readonly (readonly Row[])[],
+  free: readonly Row[],
   settings: Settings,
   budget: Budget,
 ): Plan["status"] {
   const { mode } = settings;
-  if (mode === "budget") return within(levels, budget);
-  const asked = mode === "target" ? reach(groups, levels, settings) : "ok";
-  if (mode === "full") for (const c of levels.keys()) levels.set(c, c.highest - 1);
-  if (fits(levels, budget)) return asked;
-  for (const c of levels.keys()) levels.set(c, 0);
-  const status = within(levels, budget);
+  if (mode === "budget") return within(free, budget);
+  const asked = mode === "target" ? reach(groups, all, settings) : "ok";
+  if (mode === "full") for (const row of free) row.level = row.c.highest - 1;
+  if (!isOver(lessen(budget, free))) return asked;
+  for (const row of free) row.level = 0;
+  const status = within(free, budget);
   return status === "ok" ? "infeasible" : status;
 }
 
@@ -118,36 +121,40 @@ function choose(
  * The cheapest levels that reach a target; the first level out of sight. For a target of fidelity the picture
  * as a whole is not to be worse than equal levels of all cells would be for the same bytes.
  */
-function reach(groups: readonly Group[], levels: Levels, { quality, target }: Settings): Plan["status"] {
+function reach(
+  groups: readonly Group[],
+  all: readonly (readonly Row[])[],
+  { quality, target }: Settings,
+): Plan["status"] {
   let status: Plan["status"] = "ok";
-  const seen: Candidate[] = [];
-  for (const { cells, needed, bound } of groups) {
-    const mine = cells.filter((c) => levels.has(c) && c.visible && c.weight > 0);
-    if (!mine.length) continue;
-    seen.push(...mine);
-    const cost = mine.map((c) => costOf(c, "bytes"));
-    const previous = mine.map(before);
-    const isKnown = bound || (!Number.isNaN(needed) && mine.every(({ mean }) => !mean.every(Number.isNaN)));
+  const seen: Row[] = [];
+  groups.forEach(({ needed, bound }, i) => {
+    const rows = (all[i] ?? []).filter(({ c, level }) => !c.always && level >= 0 && visibleWeight(c) > 0);
+    if (!rows.length) return;
+    seen.push(...rows);
+    const cost = rows.map(({ c }) => bytesOf(c));
+    const previous = rows.map(({ c }) => before(c));
+    const isKnown = !Number.isNaN(needed) && rows.every(({ c }) => c.mean.some((q) => !Number.isNaN(q)));
     const found = bound
-      ? cheapest([bound.slice(0, mine[0]?.highest)], cost, target, { previous })
+      ? cheapest([bound.slice(0, rows[0]?.c.highest)], cost, target, { previous })
       : together(
-          { cost, mean: mine.map(qualityOf), share: mine.map(({ share }) => share), previous },
+          { cost, mean: rows.map(({ c }) => qualityOf(c)), share: rows.map(({ c }) => c.share), previous },
           isKnown ? needed : 1,
         );
     if (found.status !== "ok") status = "infeasible";
-    mine.forEach((c, i) => {
-      levels.set(c, found.levels[i] ?? 0);
+    rows.forEach((row, k) => {
+      row.level = found.levels[k] ?? 0;
     });
-  }
+  });
   if (quality !== "fidelity") return status;
   const filled = fill(
-    seen.map((c) => levels.get(c) ?? 0),
-    seen.map((c) => c.mean),
-    seen.map((c) => costOf(c, "bytes")),
-    seen.map(visibleWeight),
+    seen.map(({ level }) => level),
+    seen.map(({ c }) => c.mean),
+    seen.map(({ c }) => bytesOf(c)),
+    seen.map(({ c }) => visibleWeight(c)),
   );
-  seen.forEach((c, i) => {
-    levels.set(c, filled[i] ?? 0);
+  seen.forEach((row, i) => {
+    row.level = filled[i] ?? 0;
   });
   return status;
 }
@@ -156,102 +163,95 @@ function reach(groups: readonly Group[], levels: Levels, { quality, target }: Se
  * Upgrades by falling gain per cost, each taken if it still fits in every unit. The cost is the largest part of
  * the budgets.
  */
-function within(levels: Levels, budget: Budget): Plan["status"] {
-  if (!fits(levels, budget)) return "over budget";
-  const cells = [...levels.keys()];
-  const values = cells.map((c) => qualityOf(c).map((quality) => visibleWeight(c) * quality));
-  const part = (c: Candidate, k: number) =>
-    Math.max(...UNITS.map((unit) => (c.ladder[unit][k] as number) / budget[unit] || 0));
-  const segments = cells.flatMap((c, i) => {
+function within(free: readonly Row[], budget: Budget): Plan["status"] {
+  const left = lessen(budget, free);
+  if (isOver(left)) return "over budget";
+  const seen = free.filter(({ c }) => visibleWeight(c) > 0);
+  const values = seen.map(({ c }) => qualityOf(c).map((quality) => visibleWeight(c) * quality));
+  const scale = UNITS.map((unit) => 1 / Math.max(budget[unit], 1));
+  const segments = seen.flatMap(({ c: { ladder } }, i) => {
     const value = values[i] ?? [];
-    return value.at(-1) === 0
-      ? []
-      : hull(
-          value.map((_, k) => part(c, k)),
-          value,
-          0,
-          i,
-        );
+    const [bytes = 0, gpuBytes = 0, count = 0] = scale;
+    const cost = value.map((_, k) =>
+      Math.max(
+        bytes * (ladder.bytes[k] ?? 0),
+        gpuBytes * (ladder.gpuBytes[k] ?? 0),
+        count * (ladder.count[k] ?? 0),
+      ),
+    );
+    return hull(cost, value, 0, i);
   });
-  takeFitting(
-    cells,
-    levels,
-    steepest(segments),
-    lessen(budget, cells, () => 0),
-  );
-  const value = (of: (c: Candidate) => number) =>
-    cells.reduce((sum, c, i) => sum + (values[i]?.[of(c)] ?? 0), 0);
-  // levels in sight that are about as good stay
-  const earlier: Levels = new Map(cells.map((c) => [c, c.visible && c.weight > 0 ? before(c) : 0]));
-  const weight = cells.reduce((sum, c) => sum + visibleWeight(c), 0);
-  const stays =
-    cells.every((c) => (earlier.get(c) ?? -1) >= 0) &&
-    fits(earlier, budget) &&
-    value((c) => earlier.get(c) ?? 0) >= value((c) => levels.get(c) ?? 0) - SLACK * weight;
-  if (stays) for (const [c, level] of earlier) levels.set(c, level);
+  for (const segment of steepest(segments)) take(seen[segment.row] as Row, segment, left);
+  // earlier levels that are about as good stay
+  const earlier = seen.map(({ c }) => ({ c, level: before(c) }));
+  const value = (rows: readonly Row[]) =>
+    rows.reduce((sum, { level }, i) => sum + (values[i]?.[level] ?? Number.NaN), 0);
+  const slack = SLACK * seen.reduce((sum, { c }) => sum + visibleWeight(c), 0);
+  if (!(value(earlier) >= value(seen) - slack)) return "ok";
+  const unseen = free.filter(({ c }) => visibleWeight(c) <= 0);
+  if (isOver(lessen(budget, [...earlier, ...unseen]))) return "ok";
+  seen.forEach((row, i) => {
+    row.level = earlier[i]?.level ?? 0;
+  });
   return "ok";
 }
 
-/** Takes each segment that continues its cell's level and fits into what is left, which it lessens. */
-function takeFitting(
-  cells: readonly Candidate[],
-  levels: Levels,
-  segments: readonly Segment[],
-  left: Record<Unit, number>,
-): void {
-  for (const { row, from, to } of segments) {
-    const c = cells[row] as Candidate;
-    if (levels.get(c) !== from) continue;
-    const more = (unit: Unit) => (c.ladder[unit][to] as number) - (c.ladder[unit][from] as number);
-    if (!UNITS.every((unit) => more(unit) <= left[unit])) continue;
-    for (const unit of UNITS) left[unit] -= more(unit);
-    levels.set(c, to);
+/** Takes a segment that continues a row's level, if it fits into what is left, which it lessens; whether it did. */
+function take(row: Row, { from, to }: Segment, left: Costs): boolean {
+  const { ladder } = row.c;
+  const more = (unit: Unit) => (ladder[unit][to] as number) - (ladder[unit][from] as number);
+  if (row.level !== from || UNITS.some((unit) => more(unit) > left[unit])) return false;
+  for (const unit of UNITS) left[unit] -= more(unit);
+  row.level = to;
+  return true;
+}
+
+/** Raises cells out of sight, the largest first, by a segment at a time. */
+function raise(free: readonly Row[], { mode, aroundBytes }: Settings, budget: Budget): void {
+  const left = lessen(budget, free);
+  if (mode === "full" || mode === "base" || !(aroundBytes > 0) || isOver(left)) return;
+  left.bytes = Math.min(left.bytes, aroundBytes);
+  let rows = free
+    .filter(({ c }) => !c.visible && c.weight > 0)
+    .sort((a, b) => b.c.potential - a.c.potential);
+  while (rows.length) {
+    rows = rows.filter((row) => {
+      const next = nextSegment(bytesOf(row.c), qualityOf(row.c), row.level);
+      return next && take(row, next, left);
+    });
   }
 }
 
-/** The levels with cells out of sight raised, the largest first, by a segment at a time. */
-function raised(levels: Levels, { mode, aroundBytes }: Settings, budget: Budget): Levels {
-  const around: Levels = new Map(levels);
-  const left = lessen(budget, [...levels.keys()], (c) => levels.get(c) ?? 0);
-  if (mode === "full" || mode === "base" || UNITS.some((unit) => left[unit] < 0)) return around;
-  const cells = [...levels.keys()]
-    .filter((c) => !c.visible && c.weight > 0)
-    .sort((a, b) => b.potential - a.potential);
-  const steps = cells.map((c, i) => hull(costOf(c, "bytes"), qualityOf(c), levels.get(c), i));
-  const rounds = Math.max(0, ...steps.map(({ length }) => length));
-  const inTurn = Array.from({ length: rounds }, (_, round) => steps.flatMap((own) => own[round] ?? []));
-  takeFitting(cells, around, inTurn.flat(), { ...left, bytes: Math.min(left.bytes, aroundBytes) });
-  return around;
-}
-
 /** Expected quality by available level: an unknown one as the one below, by the bytes if all are. */
-function qualityOf({ mean, ladder, highest }: Candidate): number[] {
-  const cost = ladder.bytes.slice(0, highest);
-  const { q, promised } = known([mean.slice(0, highest)], [cost]);
+function qualityOf({ mean, ladder, highest }: Candidate): readonly number[] {
+  const some = highest < mean.length ? mean.slice(0, highest) : mean;
+  if (!some.some(Number.isNaN)) return some;
+  const most = ladder.bytes[highest - 1] ?? 1;
+  if (some.every(Number.isNaN)) return some.map((_, k) => Math.sqrt((ladder.bytes[k] ?? 0) / most));
   let last = 0;
-  return (q[0] ?? []).map((quality, k) => {
-    if (!promised[0] || !Number.isNaN(mean[k])) last = quality;
+  return some.map((quality) => {
+    if (!Number.isNaN(quality)) last = quality;
     return last;
   });
 }
 
 const before = (c: Candidate): number => (c.previous <= c.highest ? c.previous - 1 : -1);
 
-/** Cost by available level. */
-const costOf = (c: Candidate, unit: Unit): readonly number[] => c.ladder[unit].slice(0, c.highest);
+/** Bytes by available level. */
+const bytesOf = ({ ladder: { bytes }, highest }: Candidate): readonly number[] =>
+  highest < bytes.length ? bytes.slice(0, highest) : bytes;
 
-const fits = (levels: Levels, budget: Budget): boolean => {
-  const left = lessen(budget, [...levels.keys()], (c) => levels.get(c) ?? 0);
-  return UNITS.every((unit) => left[unit] >= 0);
-};
+type Costs = Record<Unit, number>;
 
-/** A budget less what cells cost at a level, from 0. */
-function lessen(
-  budget: Budget,
-  cells: readonly Candidate[],
-  level: (c: Candidate) => number,
-): Record<Unit, number> {
-  const left = { ...budget };
-  for (const c of cells) for (const unit of UNITS) left[unit] -= c.ladder[unit][level(c)] ?? 0;
+const isOver = (left: Costs): boolean => left.bytes < 0 || left.gpuBytes < 0 || left.count < 0;
+
+/** A budget less what cells cost. */
+function lessen({ bytes, gpuBytes, count }: Budget, rows: readonly Row[]): Costs {
+  const left = { bytes, gpuBytes, count };
+  for (const { c, level } of rows) {
+    left.bytes -= c.ladder.bytes[level] ?? 0;
+    left.gpuBytes -= c.ladder.gpuBytes[level] ?? 0;
+    left.count -= c.ladder.count[level] ?? 0;
+  }
   return left;
 }

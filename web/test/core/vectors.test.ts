@@ -75,7 +75,8 @@ test.skipIf(!cases.length)("promises are those of the Python package", () => {
         for (const [i, entry] of family.entries.entries()) {
           const own = seen.find(({ id }) => id === entry.cell.id);
           near(entry.share, own?.share ?? 0, `${name}: share`);
-          if (entry.sight.visible) own?.mean.forEach((mean, k) => near(entry.mean[k] ?? 0, mean, name));
+          const means = entry.sight.visible ? (own?.mean ?? []) : [];
+          for (const [k, mean] of means.entries()) near(entry.mean[k] ?? 0, mean, `${name}: mean`);
           if (entry.share > 0) sum += entry.share * (entry.mean[(told?.levels[i] ?? 0) - 1] ?? Number.NaN);
           total += entry.share;
         }
