@@ -3,7 +3,7 @@
  * src/sagesplat/adapt/allocate.py; tests/data/plans.json checks both.
  */
 
-import { hull, steepest } from "./hull";
+import { climb } from "./hull";
 
 /** A matrix: a row per cell or label, a column per level. */
 export type Table = readonly (readonly number[])[];
@@ -69,11 +69,12 @@ export function together(cells: Cells, needed: number): { levels: number[]; stat
   const value = mean.map((row, i) => row.map((q) => (share[i] ?? 0) * q));
   const goal = needed * share.reduce((sum, s) => sum + s, 0) - ROUNDING;
   let reached = total(value, levels);
-  for (const { row, to, gain } of steepest(cost.flatMap((costs, i) => hull(costs, value[i] ?? [], 0, i)))) {
-    if (reached >= goal) break;
+  climb(cost, value, levels, ({ row, to, gain }) => {
+    if (reached >= goal) return false;
     levels[row] = to;
     reached += gain;
-  }
+    return true;
+  });
   if (reached < goal) {
     const best = mean.map((row) => Math.max(0, row.indexOf(Math.max(...row))));
     return { levels: best, status: "infeasible" };

@@ -4,7 +4,7 @@
  */
 
 import type { Table } from "./allocate";
-import { hull, steepest } from "./hull";
+import { climb, type Segment } from "./hull";
 
 const SLACK = 0.004;
 
@@ -36,14 +36,22 @@ export function fill(
   );
   let { bytes, value } = totals(rows, found);
   if (reached(bytes, value, uniform, total)) return found;
-  const upgrades = rows.flatMap(({ cost, value }, i) => hull(cost, value, found[i] ?? 0, i));
-  for (const { row: label, to } of steepest(upgrades)) {
-    const [row, before] = [rows[label] as Row, found[label] as number];
-    bytes += at(row.cost, to) - at(row.cost, before);
-    value += at(row.value, to) - at(row.value, before);
-    found[label] = to;
-    if (reached(bytes, value, uniform, total)) break;
-  }
+  let isDone = false;
+  const take = ({ row, to }: Segment) => {
+    if (isDone) return false;
+    const [{ cost, value: values }, before] = [rows[row] as Row, found[row] as number];
+    bytes += at(cost, to) - at(cost, before);
+    value += at(values, to) - at(values, before);
+    found[row] = to;
+    isDone = reached(bytes, value, uniform, total);
+    return true;
+  };
+  climb(
+    rows.map(({ cost }) => cost),
+    rows.map(({ value }) => value),
+    found,
+    take,
+  );
   return found;
 }
 

@@ -3,7 +3,7 @@
 import type { Budget, Level, Settings } from "../types";
 import { cheapest, together } from "./allocate";
 import { fill } from "./fill";
-import { hull, nextSegment, type Segment, steepest } from "./hull";
+import { climb, nextSegment, type Segment } from "./hull";
 
 /** The planner's input for a cell, or for a label all of whose cells have one level. */
 export interface Candidate {
@@ -167,21 +167,23 @@ function within(free: readonly Row[], budget: Budget): Plan["status"] {
   const left = lessen(budget, free);
   if (isOver(left)) return "over budget";
   const seen = free.filter(({ c }) => visibleWeight(c) > 0);
-  const values = seen.map(({ c }) => qualityOf(c).map((quality) => visibleWeight(c) * quality));
+  const values = seen.map(({ c }) => {
+    const weight = visibleWeight(c);
+    return qualityOf(c).map((quality) => weight * quality);
+  });
   const scale = UNITS.map((unit) => 1 / Math.max(budget[unit], 1));
-  const segments = seen.flatMap(({ c: { ladder } }, i) => {
-    const value = values[i] ?? [];
-    const [bytes = 0, gpuBytes = 0, count = 0] = scale;
-    const cost = value.map((_, k) =>
+  const [bytes = 0, gpuBytes = 0, count = 0] = scale;
+  const costs = seen.map(({ c: { ladder } }, i) =>
+    (values[i] ?? []).map((_, k) =>
       Math.max(
         bytes * (ladder.bytes[k] ?? 0),
         gpuBytes * (ladder.gpuBytes[k] ?? 0),
         count * (ladder.count[k] ?? 0),
       ),
-    );
-    return hull(cost, value, 0, i);
-  });
-  for (const segment of steepest(segments)) take(seen[segment.row] as Row, segment, left);
+    ),
+  );
+  const levels = seen.map(({ level }) => level);
+  climb(costs, values, levels, (segment) => take(seen[segment.row] as Row, segment, left));
   // earlier levels that are about as good stay
   const earlier = seen.map(({ c }) => ({ c, level: before(c) }));
   const value = (rows: readonly Row[]) =>
@@ -196,11 +198,11 @@ function within(free: readonly Row[], budget: Budget): Plan["status"] {
   return "ok";
 }
 
-/** Takes a segment that continues a row's level, if it fits into what is left, which it lessens; whether it did. */
+/** Takes a row's next segment, if it fits into what is left, which it lessens; whether it did. */
 function take(row: Row, { from, to }: Segment, left: Costs): boolean {
   const { ladder } = row.c;
   const more = (unit: Unit) => (ladder[unit][to] as number) - (ladder[unit][from] as number);
-  if (row.level !== from || UNITS.some((unit) => more(unit) > left[unit])) return false;
+  if (UNITS.some((unit) => more(unit) > left[unit])) return false;
   for (const unit of UNITS) left[unit] -= more(unit);
   row.level = to;
   return true;
@@ -211,9 +213,7 @@ function raise(free: readonly Row[], { mode, aroundBytes }: Settings, budget: Bu
   const left = lessen(budget, free);
   if (mode === "full" || mode === "base" || !(aroundBytes > 0) || isOver(left)) return;
   left.bytes = Math.min(left.bytes, aroundBytes);
-  let rows = free
-    .filter(({ c }) => !c.visible && c.weight > 0)
-    .sort((a, b) => b.c.potential - a.c.potential);
+  let rows = free.filter(({ c }) => !c.visible && c.weight > 0).sort((a, b) => b.c.potential - a.c.potential);
   while (rows.length) {
     rows = rows.filter((row) => {
       const next = nextSegment(bytesOf(row.c), qualityOf(row.c), row.level);

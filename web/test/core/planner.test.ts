@@ -3,7 +3,7 @@
 import { describe, expect, test } from "vitest";
 import { together } from "../../src/core/allocate";
 import { fill } from "../../src/core/fill";
-import { hull, steepest } from "../../src/core/hull";
+import { climb, nextSegment, type Segment } from "../../src/core/hull";
 import { type Candidate, type Group, ladderOf, makePlan } from "../../src/core/planner";
 import type { Settings } from "../../src/types";
 import { Network, seeded, VirtualClock } from "../simulate";
@@ -59,6 +59,13 @@ const cell = (bytes: number[], mean: number[], more: Partial<Candidate> = {}): C
   previous: 0,
   ...more,
 });
+/** All segments of a cell's hull. */
+function hull(cost: readonly number[], value: readonly number[]): Segment[] {
+  const found: Segment[] = [];
+  climb([cost], [value], [0], (segment) => Boolean(found.push(segment)));
+  return found;
+}
+
 const planOf = (groups: Group[], partial: Partial<Settings> = {}) => makePlan(groups, settings(partial));
 
 describe("cells of a label", () => {
@@ -212,12 +219,10 @@ describe("budgets", () => {
       }
       const found = wanted.flat();
       expect(cost(found, cells).bytes).toBeLessThanOrEqual(bytes);
-      const segments = cells.flatMap((c, i) =>
+      const segments = cells.flatMap((c) =>
         hull(
           c.ladder.bytes,
           c.mean.map((m) => m * c.share),
-          0,
-          i,
         ),
       );
       expect(value(found)).toBeGreaterThanOrEqual(best - Math.max(0, ...segments.map(({ gain }) => gain)));
@@ -331,15 +336,31 @@ test("labels of fewer levels, and of unknown quality, are filled like the others
 });
 
 test("segments fall, and of equal ones those of the lower row come first", () => {
-  const both = [hull([1, 2, 4], [0, 1, 2], 0, 1), hull([1, 2, 4], [0, 1, 2], 0, 0)].flat();
-  expect(steepest(both).map(({ row, from, to }) => [row, from, to])).toEqual([
+  const order: number[][] = [];
+  const row = [1, 2, 4];
+  climb(
+    [row, row, [1, 2, 3]],
+    [
+      [0, 1, 2],
+      [0, 1, 2],
+      [0, 0.1, 0.2],
+    ],
+    [0, 0, 0],
+    (segment) => {
+      order.push([segment.row, segment.from, segment.to]);
+      return segment.row < 2;
+    },
+  );
+  expect(order).toEqual([
     [0, 0, 1],
     [1, 0, 1],
     [0, 1, 2],
     [1, 1, 2],
+    [2, 0, 1], // not taken: the row stays
   ]);
   expect(hull([1, 2, 3], [0, 0.1, 1])).toMatchObject([{ from: 0, to: 2 }]);
-  expect(hull([1, 1], [0, 1])).toMatchObject([{ to: 1, slope: Infinity }]);
+  expect(nextSegment([1, 1], [0, 1], 0)).toMatchObject({ to: 1, slope: Infinity });
+  expect(nextSegment([1, 2], [1, 1], 0)).toBeNull();
 });
 
 test("broken increments cap a cell, and one without any level is left out", () => {
