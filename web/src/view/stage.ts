@@ -161,6 +161,7 @@ export class Stage {
     if (Number.isNaN(this.#heldSince)) this.#heldSince = now;
     if (!may || now - this.#heldSince > LONGEST_HOLD) return false;
     for (const layer of late) void layer?.spark.update({ scene: layer.scene, camera: this.camera });
+    this.invalidate(); // Spark says once that it is dirty, until it draws
     return true;
   }
 
