@@ -15,7 +15,7 @@ import { SparkLayer } from "./spark";
 
 const FOV = 60; // degrees, of the window's shorter side, unless a photo's lens is set
 const NEAR = 0.03; // metres
-const LONGEST_HOLD = 250; // ms that a picture stays for want of the next one
+const LONGEST_HOLD = 600; // ms that a picture stays for want of the next one
 const FAR = 1e5; // beyond the sky of a large scene: up to 100 scene extents away
 
 /** The canvas: one camera and the adapted scene, beside the full scene while they are compared. */
