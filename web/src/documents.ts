@@ -8,7 +8,7 @@ export type Sha256 = string;
 export type Box = [number, number, number, number, number, number];
 /** A path below the bundle's folder. */
 export type Path = string;
-/** A range of a coded stream, which is one file for all levels of a label; or SPZ version 3; or a binary PLY in INRIA's layout, its y and z opposite to the bundle's. */
+/** A range of a coded stream, of which a cell has one, and a file those of a label; or SPZ version 3; or a binary PLY in INRIA's layout, its y and z opposite to the bundle's. */
 export type Format = "stream" | "spz" | "ply";
 /** Whether a bound holds at its confidence, or calibration views were too few for that. */
 export type Status = "calibrated" | "uncalibrated";
@@ -77,12 +77,8 @@ export interface Manifest {
 export interface Label {
   /** -1: unlabelled. */
   id: number;
-  /** Name in the taxonomy; CATEGORY@BLOCK in a scene in blocks. */
+  /** Name in the taxonomy. */
   name: string;
-  /** In a scene in blocks: the name without the block; title and colour are the category's. */
-  category?: string;
-  /** In a scene in blocks: the block of the ground plane. */
-  block?: number;
   /** Of an instance: the name of its category, such as chair for chair 1. */
   parent?: string;
   /** Display name. */
@@ -94,21 +90,32 @@ export interface Label {
   always: boolean;
   /** Not shown to begin with. */
   hidden?: true;
-  /** Bounding boxes (smallest x y z, largest x y z) of parts with about equal numbers of points. */
-  boxes: Box[];
-  levels: Level[];
+  cells: Cell[];
   quality: {
     fidelity?: LabelQuality;
     ssim?: LabelQuality;
   };
 }
+/** A compact part of a label, with levels of its own. */
+export interface Cell {
+  /** No other cell of the bundle has it. */
+  id: number;
+  bounds: Box;
+  /** x y z w of each point: its position along each axis of the bounds, and its part of the area, in 1/255 of the bounds and of the sum of all w. */
+  points: number[];
+  /** That all points stand for, world units squared. */
+  area: number;
+  /** By how far Gaussians lie around their point, world units. */
+  radius: number;
+  levels: Level[];
+}
 /** The increment that a level adds to the level below, or replaces it by. `sha256` is of its bytes: of the file, or of the range. */
 export interface Level {
   uri: Path;
   format: Format;
-  /** Of a range: its first byte in the file. The ranges of a label touch, and fill the file. */
+  /** Of a range: its first byte in the file. The ranges of a label's cells touch, and fill the file. */
   offset?: number;
-  /** Weight of the second opacities of all Gaussians of the label where this is its newest level. Without it each has one opacity. */
+  /** Weight of the second opacities of all Gaussians of the cell where this is its newest level. Without it each has one opacity. */
   weight?: number;
   /** The level shows none of the increments below it. Without this it adds to them. */
   refine?: "REPLACE";
@@ -119,7 +126,7 @@ export interface Level {
 }
 /** Quality by level whatever the viewpoint, until the viewpoint models are there. */
 export interface LabelQuality {
-  /** Levels of the label that have a prediction, ascending. */
+  /** Levels that have a prediction, ascending: all cells at that level, or at their last one. */
   levels: number[];
   status: Status;
   confidence: number;
@@ -140,7 +147,7 @@ export interface Pack {
   /** Sum over the increments in it. */
   bytes: number;
   sha256: Sha256;
-  /** Index into labels, level (1-based). */
+  /** Id of a cell, level (1-based). */
   order: [Whole, Whole][];
 }
 export interface Camera {
@@ -169,27 +176,31 @@ export interface Promises {
   photos: [Steps, Steps, Steps, Steps, Steps, Steps];
   labels: LabelPromises[];
 }
-/** The viewpoint model of a label. */
+/** The viewpoint models of a label's cells, and its calibration. */
 export interface LabelPromises {
   id: number;
-  /** 1-based levels with a prediction. */
-  levels: number[];
   status: Status;
   confidence: number;
   /** Below it there is no bound. */
   leastSupport: number;
+  /** Length scales of position, direction, log screen, log distance. */
+  lengths: [number, number, number, number];
   targets: Steps;
   thresholds: Steps;
   slopes: Steps;
+  cells: CellPromises[];
+}
+/** The viewpoint model of a cell; for SSIM against photos that of the label as a whole. */
+export interface CellPromises {
+  /** -1: all cells of the label. */
+  id: number;
+  /** 1-based levels with a prediction. */
+  levels: number[];
   /** For an unknown distance. */
   medianLogDistance: number;
-  /** Length scales of position, direction, log screen, log distance. */
-  lengths: [number, number, number, number];
-  /** By level; empty: 0. */
-  curves: Curve[];
   /** By level. */
   offsets: number[];
-  /** Rows of the shared views: differences. */
+  /** Rows of the shared views: differences. None: the mean is the offsets. */
   views: Whole[];
   /** By own view: differences. */
   logDistances: {
@@ -201,8 +212,11 @@ export interface LabelPromises {
     units: Unit[];
     steps: Steps[];
   };
-  shares: Steps;
-  corrections: Steps;
+  factors?: Steps;
+  /** By level; none: 0. Of a label as a whole. */
+  curves?: Curve[];
+  shares?: Steps;
+  corrections?: Steps;
 }
 /** K1 exp(-g1 |d - mu1|^a1) for d < beta, K2 exp(-g2 |d - mu2|^a2) from beta on (Eq. 3). */
 export interface Curve {

@@ -4,8 +4,8 @@ import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
 import { type Source, sourceInside } from "./inside";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
+import { colorsOf } from "./view/colors";
 import { openViewer } from "./view/open";
-import { colorsOf } from "./view/spark";
 import { embed, type Viewer } from "./view/viewer";
 
 declare global {

@@ -11,16 +11,21 @@ type Immutable<T> = { readonly [K in keyof T]: Immutable<T[K]> };
 
 export type Manifest = Immutable<documents.Manifest>;
 export type Label = Immutable<documents.Label>;
+export type Cell = Immutable<documents.Cell>;
 export type LabelQuality = Immutable<documents.LabelQuality>;
 export type Level = Immutable<documents.Level>;
 export type Camera = Immutable<documents.Camera>;
 export type Pack = Immutable<documents.Pack>;
 export type Promises = Immutable<documents.Promises>;
 export type LabelPromises = Immutable<documents.LabelPromises>;
+export type CellPromises = Immutable<documents.CellPromises>;
 export type Curve = Immutable<documents.Curve>;
 export type Vec3 = Immutable<documents.Vec3>;
 export type Quat = Immutable<documents.Quaternion>;
 export type Box = Immutable<documents.Box>;
+
+/** Half width and half height of a picture at distance 1. */
+export type Lens = readonly [number, number];
 
 /** A camera's pose and field of view. Position in units of its frame, `fovY` in radians. */
 export interface Pose {
@@ -35,6 +40,7 @@ export interface Viewpoint {
   readonly direction: Vec3; // unit
   /** Six half spaces [nx, ny, nz, d] with n x + d >= 0 inside; empty: unlimited view. */
   readonly frustum: readonly (readonly [number, number, number, number])[];
+  readonly lens: Lens;
   /** Focal length of what is drawn, in its pixels; absent: that of the photos. */
   readonly focal?: number;
 }
@@ -53,17 +59,19 @@ export interface Settings {
   readonly weights: ReadonlyMap<number, number>; // by label id
   readonly always?: ReadonlyMap<number, boolean>; // by label id, where it is not as in the manifest
   readonly cacheBytes: number; // of decoded increments that are not shown
+  readonly aroundBytes: number; // beside the plan, for cells out of sight that a turn of the head shows
 }
 
 /** Draws increments; independent of plans and networks. */
 export interface Renderer {
   /**
-   * Decodes an increment, which is drawn after `swap` shows it. Rejects for an invalid file.
+   * Decodes an increment of a cell, which is drawn after `swap` shows it. Rejects for an invalid file.
    *
    * @param below - of a stream, the increments below it
    */
   decode(
     label: number,
+    cell: number,
     level: number,
     bytes: Uint8Array,
     format: Format,
@@ -76,6 +84,7 @@ export interface Renderer {
 
 export interface Handle {
   readonly label: number;
+  readonly cell: number;
   readonly level: number;
   readonly count: number;
 }
@@ -83,18 +92,27 @@ export interface Handle {
 /** "outside": far from all that was sampled or photographed, so no promise is given; "unknown": no model. */
 export type Trust = Status | "outside" | "unknown";
 
-export interface LabelState {
-  readonly label: Label;
+export interface CellState {
+  readonly cell: Cell;
   readonly wanted: number; // level of the plan, 0 = none
   readonly shown: number; // drawn level
+  readonly visible: boolean; // in the frustum
+}
+
+export interface LabelState {
+  readonly label: Label;
+  readonly cells: readonly CellState[];
+  readonly splats: number; // in full, of its cells in sight, or else of all
+  readonly wanted: number; // share of these that is planned
+  readonly shown: number; // the same of those drawn
   readonly loading: boolean;
   readonly error: string | null;
-  readonly visible: boolean; // in the frustum
-  readonly distance: number; // NaN: unknown
+  readonly visible: boolean; // any cell
+  readonly distance: number; // of the nearest cell; NaN: out of sight
   readonly promised: number; // quality of what is drawn that 95 of 100 such views have, at most the target; NaN: none
-  readonly expected: number; // mean quality at the shown level
+  readonly expected: number; // mean quality of what is drawn of it in sight
   readonly trust: Trust; // in the promise
-  readonly count: number; // splats shown
+  readonly count: number; // splats shown, as bytes and GPU bytes of all cells
   readonly bytes: number;
   readonly gpuBytes: number;
 }

@@ -6,12 +6,12 @@ import { rotate } from "../src/core/distance";
 import type { Fetch } from "../src/core/download";
 import { loadManifest, parsePromises } from "../src/core/manifest";
 import { ladderOf } from "../src/core/planner";
-import { Entry } from "../src/core/residency";
+import { entriesOf } from "../src/core/residency";
 import { Streamer } from "../src/core/streamer";
-import { ViewpointModels } from "../src/core/viewpoints";
+import { familiesOf, ViewpointModels } from "../src/core/viewpoints";
 import type { Manifest, Settings, Viewpoint } from "../src/types";
 import { FakeRenderer, Network, putIncrements, VirtualClock } from "./simulate";
-import { BASE, frustumOf, NO_BUDGET } from "./worlds";
+import { BASE, frustumOf, lensOf, NO_BUDGET } from "./worlds";
 
 /** The texts of a bundle; of its chunks only the sizes matter. */
 export interface Documents {
@@ -44,7 +44,10 @@ const FULL: Settings = {
   budget: NO_BUDGET,
   weights: new Map(),
   cacheBytes: 1e9,
+  aroundBytes: 0,
 };
+
+const cellsOf = ({ labels }: Manifest) => labels.flatMap(({ cells }) => cells);
 
 /** A link with a bundle at its other end. */
 function linkTo(documents: Documents, { mbit, connections }: Line) {
@@ -62,21 +65,22 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
   return { clock, network, renderer: new FakeRenderer(clock) };
 }
 
-/** Says the expected SSIM of some levels (0: nothing) at a viewpoint: 0 where nothing is drawn. */
+/** Says the expected SSIM of some levels of cells (0: nothing) at a viewpoint: 0 where nothing is drawn. */
 export function judge(manifest: Manifest, promises: string): (view: Viewpoint, levels: number[]) => number {
   const models = new ViewpointModels(
     "fidelity",
     manifest.labels,
     parsePromises(promises, "promises", "fidelity"),
   );
-  const entries = manifest.labels.map((label) => new Entry(label));
+  const entries = entriesOf(manifest.labels);
+  const families = familiesOf(entries);
   return (view, levels) => {
     let [sum, total] = [0, 0];
+    models.see(families, view);
     entries.forEach((entry, i) => {
-      models.see(entry, view);
-      const known = entry.prediction.mean.some((value) => !Number.isNaN(value));
+      const known = entry.mean.some((value) => !Number.isNaN(value));
       if (!entry.sight.visible || !known) return;
-      const values = entry.prediction.mean.slice(0, levels[i] ?? 0).filter((value) => !Number.isNaN(value));
+      const values = entry.mean.slice(0, levels[i] ?? 0).filter((value) => !Number.isNaN(value));
       sum += entry.share * Math.max(0, ...values);
       total += entry.share;
     });
@@ -90,12 +94,13 @@ export const cameraViews = (manifest: Manifest): Viewpoint[] =>
     position,
     direction: rotate(quaternion, [0, 0, -1]),
     frustum: frustumOf(position, quaternion, fovY, width / height),
+    lens: lensOf(fovY, width / height),
   }));
 
 function startView(manifest: Manifest): Viewpoint {
   const { position, quaternion } = manifest.start;
   const direction = rotate(quaternion, [0, 0, -1]);
-  return { position, direction, frustum: frustumOf(position, quaternion, 0.9, 1.6) };
+  return { position, direction, frustum: frustumOf(position, quaternion, 0.9, 1.6), lens: lensOf(0.9, 1.6) };
 }
 
 /** The page names the pack, which is asked for together with the manifest. */
@@ -121,9 +126,10 @@ export async function streamed(
     const streamer = new Streamer({ manifest, base: BASE, renderer, settings, clock, fetch, digest: null });
     renderer.watch = () => {
       const { labels, bytesLoaded, status } = streamer.state;
-      const levels = labels.map((label) => label.shown);
+      const cells = labels.flatMap((label) => label.cells);
+      const levels = cells.map((cell) => cell.shown);
       const whole = status !== "loading";
-      const planned = labels.map(({ label, wanted }) => ladderOf(label).bytes[wanted - 1] ?? 0);
+      const planned = cells.map(({ cell, wanted }) => ladderOf(cell).bytes[wanted - 1] ?? 0);
       const takes = planned.reduce((sum, bytes) => sum + bytes, head + documents.promises.length);
       curve.push({ ms: clock.now(), bytes: head + bytesLoaded, ssim: ssim(view, levels), whole, takes });
     };
@@ -141,7 +147,7 @@ export async function streamed(
 export function oneFile(documents: Documents, { mbit }: Line): Sample[] {
   const manifest: Manifest = JSON.parse(documents.manifest);
   const ms = LATENCY + (8 * manifest.totals.bytes) / (mbit * 1000);
-  const full = manifest.labels.map((label) => label.levels.length);
+  const full = cellsOf(manifest).map(({ levels }) => levels.length);
   const ssim = judge(manifest, documents.promises)(startView(manifest), full);
   return [NOTHING, { ms, bytes: manifest.totals.bytes, ssim, whole: true, takes: 0 }];
 }
@@ -153,8 +159,8 @@ export async function fileOrder(documents: Documents, line: Line): Promise<Sampl
   const ssim = judge(manifest, documents.promises);
   const view = startView(manifest);
   const head = LATENCY + (8 * documents.manifest.length) / (line.mbit * 1000);
-  const todo = manifest.labels.flatMap((label, i) => label.levels.map((file, k) => ({ file, i, k })));
-  const here = manifest.labels.map(() => new Set<number>());
+  const todo = cellsOf(manifest).flatMap(({ levels }, i) => levels.map((file, k) => ({ file, i, k })));
+  const here = cellsOf(manifest).map(() => new Set<number>());
   let bytes = documents.manifest.length;
   const curve: Sample[] = [NOTHING];
   const worker = async (): Promise<void> => {
@@ -193,7 +199,7 @@ export async function walked(documents: Documents, line: Line, partial: Partial<
   const { clock, network, renderer } = linkTo(documents, line);
   const manifest: Manifest = JSON.parse(documents.manifest);
   const ssim = judge(manifest, documents.promises);
-  const full = manifest.labels.map((label) => label.levels.length);
+  const full = cellsOf(manifest).map(({ levels }) => levels.length);
   const settings = { ...FULL, ...partial };
   const { fetch } = network;
   const streamer = new Streamer({ manifest, base: BASE, renderer, settings, clock, fetch, digest: null });
@@ -203,7 +209,7 @@ export async function walked(documents: Documents, line: Line, partial: Partial<
     streamer.update(view);
     await clock.pass(1000);
     const { labels, bytesLoaded: bytes, count } = streamer.state;
-    const levels = labels.map((label) => label.shown);
+    const levels = labels.flatMap(({ cells }) => cells.map((cell) => cell.shown));
     steps.push({ second: second + 1, bytes, count, ssim: ssim(view, levels), full: ssim(view, full) });
   }
   streamer.dispose();

@@ -283,7 +283,7 @@ export class Network {
 /** Puts files of the right sizes there for all increments of a manifest. */
 export function putIncrements(network: Network, { labels, pack }: Manifest): void {
   if (pack) network.files.set(pack.uri, new Uint8Array(pack.bytes));
-  for (const { uri, bytes, offset = 0 } of labels.flatMap(({ levels }) => levels)) {
+  for (const { uri, bytes, offset = 0 } of labels.flatMap(({ cells }) => cells.flatMap((c) => c.levels))) {
     const size = offset + bytes;
     if (bytes && size > (network.files.get(uri)?.length ?? 0)) network.files.set(uri, new Uint8Array(size));
   }
@@ -303,7 +303,7 @@ export class FakeRenderer implements Renderer {
   readonly alive = new Set<Handle>();
   decoded = 0;
   swaps: { show: readonly Handle[]; hide: readonly Handle[] }[] = [];
-  readonly corrupt = new Set<string>(); // "label/level" that cannot be decoded
+  readonly corrupt = new Set<string>(); // "cell/level" that cannot be decoded
   /** Called after every swap. */
   watch: () => void = () => {};
 
@@ -314,16 +314,17 @@ export class FakeRenderer implements Renderer {
 
   decode(
     label: number,
+    cell: number,
     level: number,
     bytes: Uint8Array,
     format: Format,
     below: readonly Uint8Array[] = [],
   ): Promise<Handle> {
     if (below.length !== (format === "stream" ? level - 1 : 0)) throw new Error("without what is below");
-    const handle: Handle = { label, level, count: bytes.length };
+    const handle: Handle = { label, cell, level, count: bytes.length };
     return new Promise((resolve, reject) => {
       this.clock.after(this.delay, () => {
-        if (this.corrupt.has(`${label}/${level}`)) return reject(new Error("not a splat file"));
+        if (this.corrupt.has(`${cell}/${level}`)) return reject(new Error("not a splat file"));
         this.alive.add(handle);
         this.decoded += 1;
         resolve(handle);
@@ -347,8 +348,8 @@ export class FakeRenderer implements Renderer {
     if (!this.alive.delete(handle)) throw new Error("disposes twice");
   }
 
-  /** Levels drawn of a label, ascending. */
-  levels(label: number): number[] {
-    return [...this.drawn].flatMap((h) => (h.label === label ? [h.level] : [])).sort((a, b) => a - b);
+  /** Levels drawn of a cell, ascending. */
+  levels(cell: number): number[] {
+    return [...this.drawn].flatMap((h) => (h.cell === cell ? [h.level] : [])).sort((a, b) => a - b);
   }
 }

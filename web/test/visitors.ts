@@ -4,9 +4,9 @@ import { rotate } from "../src/core/distance";
 import type { Fetch } from "../src/core/download";
 import { loadManifest } from "../src/core/manifest";
 import { Streamer } from "../src/core/streamer";
-import type { Manifest, Quat, Settings, Vec3, Viewpoint } from "../src/types";
+import type { Level, Manifest, Quat, Settings, Vec3, Viewpoint } from "../src/types";
 import { FakeRenderer, Network, putIncrements, seeded, VirtualClock } from "./simulate";
-import { BASE, frustumOf, NO_BUDGET } from "./worlds";
+import { BASE, frustumOf, lensOf, NO_BUDGET } from "./worlds";
 
 /** A file of a bundle, as a server has it. */
 export interface Served {
@@ -161,13 +161,14 @@ function recording(network: Network, clock: VirtualClock, log: Request[]): Fetch
 
 /** A manifest whose increments have so many times the bytes; `pack`: whether it keeps its pack. */
 export function resized(manifest: Manifest, scale: number, pack: boolean): Manifest {
+  const resize = (level: Level): Level => ({
+    ...level,
+    bytes: level.bytes * scale,
+    ...(level.offset !== undefined && { offset: level.offset * scale }),
+  });
   const labels = manifest.labels.map((label) => ({
     ...label,
-    levels: label.levels.map((level) => ({
-      ...level,
-      bytes: level.bytes * scale,
-      ...(level.offset !== undefined && { offset: level.offset * scale }),
-    })),
+    cells: label.cells.map((cell) => ({ ...cell, levels: cell.levels.map(resize) })),
   }));
   const totals = { ...manifest.totals, bytes: manifest.totals.bytes * scale };
   const stream = manifest.pack && { ...manifest.pack, bytes: manifest.pack.bytes * scale };
@@ -213,6 +214,7 @@ export async function visit(
     budget: NO_BUDGET,
     weights: new Map(manifest.labels.map(({ id, weight }) => [id, weight])),
     cacheBytes: 128e6,
+    aroundBytes: 0.05 * manifest.totals.bytes,
     ...profile.settings(manifest),
   };
   const poseAt = path(manifest, seconds, seed);
@@ -220,7 +222,12 @@ export async function visit(
   const view = (): Viewpoint => {
     const { position, quaternion } = poseAt((clock.now() - began) / 1000);
     const frustum = frustumOf(position, quaternion, FOV_Y, profile.aspect);
-    return { position, direction: rotate(quaternion, [0, 0, -1]), frustum };
+    return {
+      position,
+      direction: rotate(quaternion, [0, 0, -1]),
+      frustum,
+      lens: lensOf(FOV_Y, profile.aspect),
+    };
   };
   const open = async () => {
     await openPage(fetch, files);

@@ -1,7 +1,7 @@
 /** A streamer in a world of its own, watched at every moment. */
 
 import { Streamer, type StreamerOptions } from "../src/core/streamer";
-import type { Manifest, Settings, State } from "../src/types";
+import type { CellState, Manifest, Settings, State } from "../src/types";
 import { digest, FakeRenderer, Network, VirtualClock } from "./simulate";
 import { BASE, bundle, DEFAULTS, type Options } from "./worlds";
 
@@ -73,28 +73,31 @@ export function world(options: Options = {}, more: Partial<StreamerOptions> = {}
 
 /** What must hold at every moment: no holes, and the state says what is drawn. */
 function watcher(streamer: Streamer, renderer: FakeRenderer): () => void {
-  const seen = new Set<number>();
+  const seen = new Set<number>(); // cells
   const { live } = streamer.manifest; // there the old may be drawn for the new
   return () => {
     const { labels, count } = streamer.state;
-    for (const id of seen) if (!labels.some(({ label }) => label.id === id)) seen.delete(id);
+    const all = labels.flatMap(({ cells }) => cells);
+    for (const id of seen) if (!all.some(({ cell }) => cell.id === id)) seen.delete(id);
     let drawn = 0;
-    for (const { label, shown, wanted } of labels) {
-      const levels = renderer.levels(label.id);
-      const start = label.levels.slice(0, shown).findLastIndex(({ refine }) => refine);
+    for (const { cell, shown, wanted } of all) {
+      const levels = renderer.levels(cell.id);
+      const start = cell.levels.slice(0, shown).findLastIndex(({ refine }) => refine);
       const isDrawn = (i: number) => i >= start && i < shown;
-      const expected = label.levels.flatMap((_, i) => (isDrawn(i) ? [i + 1] : []));
+      const expected = cell.levels.flatMap((_, i) => (isDrawn(i) ? [i + 1] : []));
       if (!live && levels.join() !== expected.join()) {
-        throw new Error(`${label.name}: draws ${levels}, says ${expected}`);
+        throw new Error(`cell ${cell.id}: draws ${levels}, says ${expected}`);
       }
-      if (seen.has(label.id) && wanted && !shown) throw new Error(`${label.name}: a hole`);
-      if (shown) seen.add(label.id);
-      drawn += label.levels.reduce((sum, file, i) => sum + (isDrawn(i) ? file.count : 0), 0);
+      if (seen.has(cell.id) && wanted && !shown) throw new Error(`cell ${cell.id}: a hole`);
+      if (shown) seen.add(cell.id);
+      else if (!wanted) seen.delete(cell.id); // left out, since the budget is that small
+      drawn += cell.levels.reduce((sum, file, i) => sum + (isDrawn(i) ? file.count : 0), 0);
     }
     if (!live && drawn !== count) throw new Error(`counts ${count}, draws ${drawn}`);
   };
 }
 
-/** Levels that are drawn, by label. */
-export const shown = (state: State): number[] => state.labels.map((label) => label.shown);
-export const wanted = (state: State): number[] => state.labels.map((label) => label.wanted);
+/** Levels that are drawn, by cell. */
+export const shown = (state: State): number[] => cellsOf(state).map((cell) => cell.shown);
+export const wanted = (state: State): number[] => cellsOf(state).map((cell) => cell.wanted);
+export const cellsOf = ({ labels }: State): CellState[] => labels.flatMap(({ cells }) => cells);

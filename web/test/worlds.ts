@@ -2,9 +2,12 @@
 
 import { rotate } from "../src/core/distance";
 import type {
+  Cell,
+  CellPromises,
   Label,
   LabelPromises,
   LabelQuality,
+  Lens,
   Level,
   Manifest,
   Pack,
@@ -27,15 +30,23 @@ export const DEFAULTS: Settings = {
   budget: NO_BUDGET,
   weights: new Map(),
   cacheBytes: 1e9,
+  aroundBytes: 0,
 };
 /** Looks along -z from a place, without a frustum. */
 export const at = (x: number, y = 0, z = 0): Viewpoint => ({
   position: [x, y, z],
   direction: [0, 0, -1],
   frustum: [],
+  lens: [0.8, 0.5],
 });
 /** Sees what is right of x = 0. */
 export const rightOf = (view: Viewpoint): Viewpoint => ({ ...view, frustum: [[1, 0, 0, 0]] });
+
+/** Half width and half height at distance 1. */
+export const lensOf = (fovY: number, aspect: number): Lens => [
+  aspect * Math.tan(fovY / 2),
+  Math.tan(fovY / 2),
+];
 
 /** Half spaces of a camera's frustum: left, right, bottom, top, front; the near plane is at the camera. */
 export function frustumOf(
@@ -63,6 +74,7 @@ export function frustumOf(
 
 export interface Options {
   readonly labels?: number;
+  readonly cells?: number; // of each label
   readonly levels?: number;
   readonly bytes?: number; // of an increment, about
   readonly seed?: number;
@@ -70,21 +82,31 @@ export interface Options {
   readonly promises?: boolean;
   readonly pack?: boolean;
   readonly replaces?: readonly number[]; // levels that replace those below
-  readonly streams?: boolean; // each label is one file, its levels ranges of it
+  readonly streams?: boolean; // each label is one file, the levels of its cells ranges of it
 }
 
-/** A bundle whose files are on a network; label i stands at x = 4 i - 8. */
+/** A bundle whose files are on a network; label i stands at x = 4 i - 8, its cells side by side. */
 export function bundle(network: Network, options: Options = {}): Manifest {
-  const { labels = 4, levels = 5, bytes = 20_000, seed = 1, live = false, promises = true } = options;
+  const {
+    labels = 4,
+    cells = 1,
+    levels = 5,
+    bytes = 20_000,
+    seed = 1,
+    live = false,
+    promises = true,
+  } = options;
   const { pack = false, replaces = [], streams = false } = options;
   const random = seeded(seed);
   const made = Array.from({ length: labels }, (_, id) => {
-    const files = Array.from({ length: levels }, (_, k) => {
-      const more = replaces.includes(k + 1) ? k + 1 : 1; // than all those below it
-      const size = Math.round(bytes * (0.5 + random()) * (k ? 1 : 0.3) * more);
-      const file = put(network, `chunks/l${id}-${k + 1}-${seed}.spz`, size, random);
-      return replaces.includes(k + 1) ? { ...file, refine: "REPLACE" as const } : file;
-    });
+    const files = Array.from({ length: cells }, (_, j) =>
+      Array.from({ length: levels }, (_, k) => {
+        const more = replaces.includes(k + 1) ? k + 1 : 1; // than all those below it
+        const size = Math.round(bytes * (0.5 + random()) * (k ? 1 : 0.3) * more);
+        const file = put(network, `chunks/l${cells * id + j}-${k + 1}-${seed}.spz`, size, random);
+        return replaces.includes(k + 1) ? { ...file, refine: "REPLACE" as const } : file;
+      }),
+    );
     return labelOf(id, streams ? streamOf(network, `chunks/l${id}-${seed}.sgst`, files) : files, random);
   });
   const models =
@@ -120,33 +142,33 @@ export const manifestOf = (
   licenses: [],
 });
 
-/** Puts files one after the other into one. */
-function streamOf(network: Network, uri: string, files: readonly Level[]): Level[] {
-  const content = new Uint8Array(files.reduce((sum, { bytes }) => sum + bytes, 0));
+/** Puts the files of cells one after the other into one. */
+function streamOf(network: Network, uri: string, cells: readonly (readonly Level[])[]): Level[][] {
+  const content = new Uint8Array(cells.flat().reduce((sum, { bytes }) => sum + bytes, 0));
   let end = 0;
-  const levels = files.map((file) => {
-    content.set(network.files.get(file.uri) ?? [], end);
-    network.files.delete(file.uri);
-    end += file.bytes;
-    return { ...file, uri, format: "stream" as const, offset: end - file.bytes };
-  });
+  const levels = cells.map((files) =>
+    files.map((file) => {
+      content.set(network.files.get(file.uri) ?? [], end);
+      network.files.delete(file.uri);
+      end += file.bytes;
+      return { ...file, uri, format: "stream" as const, offset: end - file.bytes };
+    }),
+  );
   network.files.set(uri, content);
   return levels;
 }
 
 /** All increments, level by level. */
 export function packOf(network: Network, labels: readonly Label[]): Pack {
-  const last = Math.max(0, ...labels.map((label) => label.levels.length));
-  const order = Array.from({ length: last }, (_, k) => labels.map((_label, i) => [i, k + 1] as const)).flat();
-  const contents = order.flatMap(([i, level]) => {
-    const { uri = "", offset = 0, bytes = 0 } = labels[i]?.levels[level - 1] ?? {};
-    return network.files.get(uri)?.subarray(offset, offset + bytes) ?? [];
-  });
-  const content = new Uint8Array(contents.reduce((sum, one) => sum + one.length, 0));
+  const cells = labels.flatMap((label) => label.cells);
+  const last = Math.max(0, ...cells.map(({ levels }) => levels.length));
+  const order = Array.from({ length: last }, (_, k) => cells.map(({ id }) => [id, k + 1] as const)).flat();
+  const contents = Array.from({ length: last }, (_, k) => cells.map(({ levels }) => levels[k])).flat();
+  const content = new Uint8Array(contents.reduce((sum, one) => sum + (one?.bytes ?? 0), 0));
   let at = 0;
-  for (const one of contents) {
-    content.set(one, at);
-    at += one.length;
+  for (const { uri, offset = 0, bytes } of contents.flatMap((one) => one ?? [])) {
+    content.set(network.files.get(uri)?.subarray(offset, offset + bytes) ?? [], at);
+    at += bytes;
   }
   return { ...store(network, "scene-1.pack", content), order };
 }
@@ -162,10 +184,10 @@ function put(network: Network, uri: string, size: number, random: () => number):
   return { ...store(network, uri, content), format: "spz", gpuBytes: 56 * count, count };
 }
 
-function labelOf(id: number, levels: readonly Level[], random: () => number): Label {
+function labelOf(id: number, cells: readonly (readonly Level[])[], random: () => number): Label {
   const best = 0.88 + 0.08 * random();
-  const means = levels.map((_, k) => best * (1 - 0.6 * Math.exp(-(k + 1) / 1.5)));
-  const x = 4 * id - 8;
+  const means = (cells[0] ?? []).map((_, k) => best * (1 - 0.6 * Math.exp(-(k + 1) / 1.5)));
+  const [left, wide] = [4 * id - 9, 2 / cells.length];
   return {
     id,
     name: `label-${id}`,
@@ -173,10 +195,20 @@ function labelOf(id: number, levels: readonly Level[], random: () => number): La
     color: "#808080",
     weight: 1,
     always: false,
-    boxes: [[x - 1, -1, -6, x + 1, 1, -4]],
-    levels,
+    cells: cells.map((levels, j) =>
+      cellOf(cells.length * id + j, [left + wide * j, -1, -6, left + wide * (j + 1), 1, -4], levels),
+    ),
     quality: { fidelity: qualityOf(means) },
   };
+}
+
+/** A cell that fills a box: points at its corners and in its middle. */
+export function cellOf(id: number, bounds: Cell["bounds"], levels: readonly Level[]): Cell {
+  const ends = [0, 255];
+  const corners = ends.flatMap((x) => ends.flatMap((y) => ends.flatMap((z) => [x, y, z, 100])));
+  const size = (axis: 0 | 1 | 2) => bounds[(axis + 3) as 3] - bounds[axis];
+  const area = size(0) * size(1) + size(1) * size(2);
+  return { id, bounds, points: [...corners, 128, 128, 128, 255], area, radius: 0.2, levels };
 }
 
 /** What holds everywhere, for these means by level. */
@@ -192,21 +224,32 @@ export const qualityOf = (means: readonly number[]): LabelQuality => ({
 export const differences = (values: readonly number[]): number[] =>
   values.map((value, i) => Math.round(value) - Math.round(values[i - 1] ?? 0));
 
-/** A model with these means by level, that vary a little from view to view. */
-export function modelOf(label: Label, rows: readonly number[], random: () => number): LabelPromises {
-  const means = label.quality.fidelity?.mean ?? [];
+/** A label's models, with the means of the label by level, that vary a little from view to view. */
+export function modelsOf(label: Label, models: readonly CellPromises[]): LabelPromises {
   return {
     id: label.id,
-    levels: means.map((_, k) => k + 1),
     status: "calibrated",
     confidence: 0.95,
     leastSupport: 0,
+    lengths: [0.5, 0.7, 0.8, 0.6],
     targets: [3000, 6000, 8000, 9000, 9900],
     thresholds: [3200, 6200, 8200, 9200, 9990],
     slopes: [0, 0, 0, 0, 0],
+    cells: models,
+  };
+}
+
+/** A cell's model, known at some rows of the shared views. */
+export function modelOf(
+  id: number,
+  means: readonly number[],
+  rows: readonly number[],
+  random: () => number,
+): CellPromises {
+  return {
+    id,
+    levels: means.map((_, k) => k + 1),
     medianLogDistance: 1.6,
-    lengths: [0.5, 0.7, 0.8, 0.6],
-    curves: [],
     offsets: means,
     views: differences(rows),
     logDistances: { unit: 0.01, steps: differences(rows.map(() => 150 + 30 * random())) },
@@ -214,8 +257,6 @@ export function modelOf(label: Label, rows: readonly number[], random: () => num
       units: means.map(() => 1e-3),
       steps: means.map(() => differences(rows.map(() => 2 * (random() - 0.5)))),
     },
-    shares: [],
-    corrections: rows.map(() => 0),
   };
 }
 
@@ -231,15 +272,21 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
     screens: [0.5, 2],
     views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6)],
     photos: [column(0), column(1), column(2), column(3), column(4), column(5)],
-    labels: labels.map((label) => ({
-      ...modelOf(label, rows, random),
-      shares: differences(rows.map(() => (10_000 * random()) / labels.length)),
-    })),
+    labels: labels.map((label) =>
+      modelsOf(
+        label,
+        label.cells.map(({ id }) => ({
+          ...modelOf(id, label.quality.fidelity?.mean ?? [], rows, random),
+          factors: differences(rows.map(() => 10 + 20 * random())),
+        })),
+      ),
+    ),
   };
 }
 
 export function totals(labels: readonly Label[]): Manifest["totals"] {
-  const all = labels.flatMap(({ levels }) =>
+  const cells = labels.flatMap((label) => label.cells);
+  const all = cells.flatMap(({ levels }) =>
     levels.slice(
       Math.max(
         0,

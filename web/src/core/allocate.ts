@@ -1,30 +1,26 @@
 /**
- * Chooses a level per label: the cheapest that reaches a target, or the highest quality within a budget.
- * Same rules as src/sagesplat/adapt/allocate.py; tests/data/plans.json checks both.
+ * The cheapest levels that reach a target: of a label as a whole, or of its cells together. Same rules as
+ * src/sagesplat/adapt/allocate.py; tests/data/plans.json checks both.
  */
 
-import { solveKnapsack, type Table, UNITS } from "./knapsack";
+import { climb } from "./hull";
+
+/** A matrix: a row per cell or label, a column per level. */
+export type Table = readonly (readonly number[])[];
 
 /** A level (from 0) per label. */
 export interface Allocation {
   readonly levels: number[];
-  readonly status: "ok" | "infeasible" | "over budget";
-  readonly cost: number; // of the composition, in the unit of the costs
-  readonly value: number; // sum of weight x quality
-  readonly bound: number; // upper bound on the value of any composition within the budget
-  readonly optimal: boolean;
+  readonly status: "ok" | "infeasible";
   readonly missed: boolean[]; // labels with known bounds, none of which reaches the target
 }
 
 export interface Options {
-  readonly weight?: readonly number[]; // per label
   readonly previous?: readonly number[]; // levels, -1: none
   readonly slack?: number; // hysteresis, SSIM: least gain of a change of level
-  readonly states?: number; // limit of partial compositions; beyond it the plan may not be optimal
 }
 
 const SLACK = 0.01;
-const STATES = 4096;
 
 /** Quality without NaN, cost with Infinity for excluded levels, and which labels have known bounds. */
 export interface Known {
@@ -49,6 +45,54 @@ export function known(quality: Table, cost: Table): Known {
   return out;
 }
 
+/** Cells of one label that are in sight. */
+export interface Cells {
+  readonly cost: Table;
+  readonly mean: Table; // never falling
+  readonly share: readonly number[]; // of the pixels
+  readonly previous?: readonly number[]; // levels, -1: none
+}
+
+const ROUNDING = 1e-9; // of what is reached
+const SAVING = 0.1; // least part of the bytes that makes a label leave its earlier levels
+
+/**
+ * The cheapest levels, from 0, by which the mean over a label's pixels reaches what is needed; those of the best
+ * quality if none do ("infeasible").
+ */
+export function together(cells: Cells, needed: number): { levels: number[]; status: Allocation["status"] } {
+  const { cost, mean, share, previous } = cells;
+  if (!(needed < 1)) {
+    return { levels: cost.map((row) => row.length - 1), status: needed > 1 ? "infeasible" : "ok" };
+  }
+  const levels = cost.map(() => 0);
+  const value = mean.map((row, i) => row.map((q) => (share[i] ?? 0) * q));
+  const goal = needed * share.reduce((sum, s) => sum + s, 0) - ROUNDING;
+  let reached = total(value, levels);
+  climb(cost, value, levels, ({ row, to, gain }) => {
+    if (reached >= goal) return false;
+    levels[row] = to;
+    reached += gain;
+    return true;
+  });
+  if (reached < goal) {
+    const best = mean.map((row) => Math.max(0, row.indexOf(Math.max(...row))));
+    return { levels: best, status: "infeasible" };
+  }
+  const before = previous?.every((level, i) => level >= 0 && level < (cost[i]?.length ?? 0))
+    ? previous
+    : null;
+  const holds =
+    before &&
+    total(value, before) >= goal &&
+    total(cost, before) - total(cost, levels) < SAVING * total(cost, before);
+  return { levels: holds ? [...before] : levels, status: "ok" };
+}
+
+/** Sum over the cells at these levels. */
+const total = (table: Table, levels: readonly number[]): number =>
+  table.reduce((sum, row, i) => sum + at(row, levels[i] ?? 0), 0);
+
 /**
  * Per label the cheapest level whose SSIM bound reaches `target`, else the best one ("infeasible").
  *
@@ -72,39 +116,7 @@ export function cheapest(
     if (!at2(promised, label)) return best.highest;
     return hold(options.previous?.[label] ?? -1, best, row, c[label] ?? [], wanted, slack);
   });
-  const { cost: total, value } = totals(levels, q, c, options.weight ?? q.map(() => 1));
-  const status = missed.includes(true) ? "infeasible" : "ok";
-  return { levels, status, cost: total, value, bound: value, optimal: true, missed };
-}
-
-/**
- * The levels with the largest sum of weight x SSIM whose cost is at most `budget`. If nothing fits, the
- * smallest composition, "over budget".
- *
- * @param budget - from 0 on, in the unit of the costs
- */
-export function bestWithin(
-  quality: Table,
-  cost: Table,
-  weight: readonly number[],
-  budget: number,
-  options: Options = {},
-): Allocation {
-  const { q, c } = known(quality, cost);
-  const previous = options.previous ?? q.map(() => -1);
-  const { slack = SLACK, states = STATES } = options;
-  const best = solveKnapsack(q, c, weight, Math.floor(budget), previous, slack, states);
-  const { cost: total, value } = totals(best.levels, q, c, weight);
-  const all = weight.reduce((sum, w) => sum + w, 0);
-  return {
-    levels: best.levels,
-    status: best.fits ? "ok" : "over budget",
-    cost: total,
-    value,
-    bound: Math.max((best.bound / UNITS) * all, value),
-    optimal: best.optimal,
-    missed: q.map(() => false),
-  };
+  return { levels, status: missed.includes(true) ? "infeasible" : "ok", missed };
 }
 
 interface Reaching {
@@ -153,16 +165,6 @@ function first(allowed: readonly boolean[], key: readonly number[], second: read
     if (best < 0 || less < 0) best = k;
   });
   return Math.max(best, 0);
-}
-
-function totals(levels: readonly number[], q: Table, c: Table, weight: readonly number[]) {
-  let cost = 0;
-  let value = 0;
-  levels.forEach((level, label) => {
-    cost += at(c[label] ?? [], level);
-    value += at(weight, label) * at(q[label] ?? [], level);
-  });
-  return { cost, value };
 }
 
 const at = (row: readonly number[], i: number): number => row[i] ?? Number.NaN;

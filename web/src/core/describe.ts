@@ -2,7 +2,10 @@
 
 import type { LabelState, Screens, State } from "../types";
 import { type Failure, TRIES_BEFORE_NOTICE } from "./downloads";
+import type { Ladder } from "./planner";
+import { boundOf } from "./quality";
 import type { Entry } from "./residency";
+import type { Family } from "./viewpoints";
 
 /** The data that a state is described from. */
 export interface Overview {
@@ -17,8 +20,9 @@ export interface Overview {
   failure(entry: Entry, level: number): Failure | undefined;
 }
 
-export function describe(entries: readonly Entry[], overview: Overview): State {
-  const labels = entries.map((entry) => labelState(entry, overview));
+export function describe(families: readonly Family[], overview: Overview): State {
+  const labels = families.map((family) => labelState(family, overview));
+  const entries = families.flatMap((family) => family.entries);
   const sum = (of: (label: LabelState) => number) => labels.reduce((total, label) => total + of(label), 0);
   const first = entries.some((e) => e.sight.visible && e.wanted > 0 && !e.shown && !e.former);
   const errors = labels.map((label) => label.error);
@@ -36,43 +40,70 @@ export function describe(entries: readonly Entry[], overview: Overview): State {
   };
 }
 
-function labelState(entry: Entry, overview: Overview): LabelState {
-  const { label, wanted, sight, prediction } = entry;
-  const { former } = entry;
-  const { level, ladder } = former ?? { level: entry.shown, ladder: entry.ladder };
+function labelState({ label, entries, outlook }: Family, overview: Overview): LabelState {
+  const drawn = entries.map((e) => e.former ?? { level: e.shown, ladder: e.ladder });
+  const visible = entries.filter(({ sight }) => sight.visible);
+  const counted = visible.length ? visible : entries;
+  const whole = counted.reduce((sum, { ladder }) => sum + (ladder.count.at(-1) ?? 0), 0);
+  const part = (level: (e: Entry) => number) =>
+    counted.reduce((sum, e) => sum + (e.ladder.count[level(e) - 1] ?? 0), 0) / whole;
+  const total = (unit: keyof Ladder) =>
+    drawn.reduce((sum, { level, ladder }) => sum + (ladder[unit][level - 1] ?? 0), 0);
+  const expected = meanOf(entries);
+  // what was calibrated is the choice for a target: more than the target is not promised
+  const promised = outlook.keeps ? Math.min(boundOf(outlook.keeps, expected), overview.asked) : Number.NaN;
   return {
     label,
-    wanted,
-    shown: level,
-    loading: entry.shown < wanted,
-    error: errorOf(entry, overview),
-    visible: sight.visible,
-    distance: sight.distance,
-    // the prediction is of the new content, and nothing is known of one that is not drawn; what was calibrated is
-    // the choice for a target: more than the target is not promised
-    promised: Math.min((former ? undefined : prediction.bound[level - 1]) ?? Number.NaN, overview.asked),
-    expected: (former ? undefined : prediction.mean[level - 1]) ?? Number.NaN,
-    trust: prediction.trust,
-    count: ladder.count[level - 1] ?? 0,
-    bytes: ladder.bytes[level - 1] ?? 0,
-    gpuBytes: ladder.gpuBytes[level - 1] ?? 0,
+    cells: entries.map(({ cell, wanted, sight }, i) => {
+      return { cell, wanted, shown: drawn[i]?.level ?? 0, visible: sight.visible };
+    }),
+    splats: whole,
+    wanted: part(({ wanted }) => wanted),
+    shown: part(({ shown }) => shown),
+    loading: entries.some(({ shown, wanted }) => shown < wanted),
+    error: entries.reduce<string | null>((error, e) => error ?? errorOf(e, overview), null),
+    visible: visible.length > 0,
+    distance: visible.length ? Math.min(...visible.map(({ sight }) => sight.distance)) : Number.NaN,
+    promised,
+    expected,
+    trust: outlook.trust,
+    count: total("count"),
+    bytes: total("bytes"),
+    gpuBytes: total("gpuBytes"),
   };
 }
 
 /**
- * The least quality promised of some labels as they are drawn; NaN where one is not drawn, or has a level without
- * a promise. Where nothing is known of a label, its last level stands for the full scene.
+ * Mean quality of what is drawn of a label, over its pixels, or where none are in sight over its cells; NaN where
+ * a part is unknown, not drawn, or of an earlier manifest.
+ */
+function meanOf(entries: readonly Entry[]): number {
+  const seen = entries.filter(({ share }) => share > 0);
+  const counted = seen.length ? seen : entries;
+  let [sum, total] = [0, 0];
+  for (const { share, mean, shown, former } of counted) {
+    const weight = seen.length ? share : 1;
+    sum += weight * (former ? Number.NaN : (mean[shown - 1] ?? Number.NaN));
+    total += weight;
+  }
+  return sum / total;
+}
+
+/**
+ * The least quality promised of some labels as they are drawn; NaN where one is not drawn, or is drawn at levels
+ * without a promise. Where nothing is known of a label, its last levels stand for the full scene.
  */
 export function leastPromise(labels: readonly LabelState[]): number {
-  const promised = labels.map(({ promised, shown, label }) =>
-    Number.isNaN(promised) && shown === label.levels.length ? Infinity : promised,
+  const least = Math.min(
+    ...labels.map(({ promised, shown }) => (Number.isNaN(promised) && shown === 1 ? Infinity : promised)),
   );
-  const least = Math.min(...promised);
   return least < Infinity ? least : Number.NaN;
 }
 
 function errorOf(entry: Entry, overview: Overview): string | null {
-  const { title, levels } = entry.label;
+  const { title: name, cells } = entry.label;
+  const title = cells.length > 1 ? `a part of ${name}` : name;
+  const { levels } = entry.cell;
   for (let level = 1; level <= levels.length; level++) {
     const failure = overview.failure(entry, level);
     if (failure?.lasting) {

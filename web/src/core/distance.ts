@@ -1,67 +1,22 @@
 /**
- * Distance and visibility of a label, by its bounding boxes. Same rules as src/sagesplat/viewer/boxes.py;
- * tests/data/distances.json checks both.
+ * How a viewpoint sees a cell, by a few points that stand for its Gaussians. Same formulas as
+ * src/sagesplat/adapt/cells.py; tests/data/promises.json checks both.
  */
 
-import type { Box, Camera, Quat, Vec3, Viewpoint } from "../types";
+import type { Cell, Quat, Vec3, Viewpoint } from "../types";
 
-/** A label as seen from a viewpoint. */
+/** A cell as seen from a viewpoint. */
 export interface Sight {
   readonly visible: boolean;
-  readonly distance: number; // the bundle's units; NaN: unknown
-  readonly size: number; // apparent size of its boxes, also out of sight: about its pixel share
+  readonly distance: number; // the bundle's units; NaN: out of sight
+  readonly apparent: number; // about its share of the pixels if nothing hid it; 0: out of sight
+  readonly potential: number; // what `apparent` would be if all of it were in sight
 }
 
-type Plane = Viewpoint["frustum"][number];
-
-const PERCENTILE = 0.05;
-const AT = [1 / 6, 1 / 2, 5 / 6]; // sample positions along each axis of a box
-
-/** Half width and half height of a picture at distance 1. */
-export type Lens = readonly [number, number];
-
-const LONGEST = 20 / 9; // of the sides of a picture that models know, the longer over the shorter
-
-/**
- * The largest of the pictures that models know, by the photos' cameras: theirs, and those of other shapes and the
- * same area. Null without cameras. Same formula as `widest_lens` in src/sagesplat/adapt/observe.py.
- */
-export function widestLens(cameras: readonly Camera[]): Lens | null {
-  if (!cameras.length) return null;
-  const largest = (side: "width" | "height", focal: 0 | 1) =>
-    Math.max(...cameras.map((c) => Math.max(c[side] / c.intrinsics[focal], longest(c)))) / 2;
-  return [largest("width", 0), largest("height", 1)];
-}
-
-const longest = ({ width, height, intrinsics: [fx, fy] }: Camera): number =>
-  Math.sqrt((width * height * LONGEST) / (fx * fy));
-
-/**
- * The frustum of a viewpoint, but no wider and no higher than a lens; the same one if it is not.
- * Models know distances in such pictures: a window that is higher also shows what lies at one's feet.
- */
-export function photoFrustum(
-  { position, direction, frustum }: Viewpoint,
-  lens: Lens | null,
-): readonly Plane[] {
-  if (!lens || frustum.length < 4) return frustum; // left, right, bottom, top, ...
-  const planes = frustum.map((plane, side) => {
-    const limit = side < 4 ? lens[side < 2 ? 0 : 1] : Infinity;
-    return narrowed(plane, position, direction, limit);
-  });
-  return planes.every((plane, side) => plane === frustum[side]) ? frustum : planes;
-}
-
-/** A side of a frustum at most `limit` from the axis, at distance 1. */
-function narrowed(plane: Plane, position: Vec3, axis: Vec3, limit: number): Plane {
-  const along = plane[0] * axis[0] + plane[1] * axis[1] + plane[2] * axis[2];
-  const across = Math.sqrt(Math.max(0, 1 - along * along));
-  if (!(along > limit * across)) return plane;
-  const length = Math.hypot(1, limit);
-  const turned = (i: 0 | 1 | 2) => ((plane[i] - along * axis[i]) / across + limit * axis[i]) / length;
-  const n = [turned(0), turned(1), turned(2)] as const;
-  return [...n, -(n[0] * position[0] + n[1] * position[1] + n[2] * position[2])];
-}
+const PERCENTILE = 0.25; // of a cell's distances
+const LABEL_PERCENTILE = 0.05; // of those of a label as a whole
+const STEPS = 255; // of positions within the bounds
+const NEAREST = 1e-9;
 
 /** A vector rotated by a quaternion x y z w of any length. */
 export function rotate(q: Quat, v: Vec3): Vec3 {
@@ -77,89 +32,77 @@ export function rotate(q: Quat, v: Vec3): Vec3 {
   ];
 }
 
-/**
- * Distance of the visible boxes: approximates the 5th percentile over a label's points.
- *
- * @param photo - half spaces of `photoFrustum`, which decide the distance where anything is in them
- */
-export function look(
-  boxes: readonly Box[],
-  { position, frustum }: Viewpoint,
-  photo: readonly Plane[] = frustum,
-): Sight {
-  const near = boxes.filter((box) => touches(box, frustum));
-  const visible = near.length > 0;
-  let nearest = Infinity;
-  let size = 0;
-  for (const box of visible ? near : boxes) {
-    const away = Math.sqrt(squareTo(position, middle(box, 0), middle(box, 1), middle(box, 2)));
-    nearest = Math.min(nearest, away);
-    size += Math.min(1, halfDiagonal(box) / Math.max(away, 1e-9)) ** 2 / boxes.length;
-  }
-  if (!visible) return { visible, distance: Number.NaN, size };
-  const sampled = new Float64Array(near.length * AT.length ** 3);
-  let found = 0;
-  for (const planes of photo === frustum ? [frustum] : [photo, frustum]) {
-    if (found) break;
-    for (const box of near) {
-      if (planes === frustum || touches(box, planes))
-        found = sample(box, position, crossing(box, planes), sampled, found);
-    }
-  }
-  return { visible, distance: found ? percentile(sampled.subarray(0, found)) : nearest, size };
-}
+/** The points of a cell, and how far they are from the viewpoint that looked last. */
+export class Points {
+  private readonly rows: Float64Array; // [n, 4] x y z area
+  private readonly radius: number;
+  private readonly distances: Float64Array; // [n]
+  private readonly weights: Float64Array; // [n] area in sight
 
-/** Whether in each half space the deepest corner of a box is inside. */
-export const touches = (box: Box, frustum: readonly Plane[]): boolean =>
-  frustum.every((plane) => corner(box, plane, 3) >= 0);
-
-/** The half spaces that do not contain the full box. */
-const crossing = (box: Box, frustum: readonly Plane[]): Plane[] =>
-  frustum.filter((plane) => corner(box, plane, 0) < 0);
-
-/** Signed height over a plane of a box's highest (`of` 3) or lowest (0) corner. */
-function corner(b: Box, plane: Plane, of: 0 | 3): number {
-  let height = plane[3];
-  for (let axis = 0; axis < 3; axis++) {
-    const n = plane[axis] as number;
-    height += n * (b[n < 0 ? axis + 3 - of : axis + of] as number);
-  }
-  return height;
-}
-
-/** Appends the squared distances of a box's samples in all half spaces; returns the new end. */
-function sample(b: Box, from: Vec3, planes: readonly Plane[], into: Float64Array, start: number): number {
-  let end = start;
-  for (const i of AT) {
-    const x = b[0] + i * (b[3] - b[0]);
-    for (const j of AT) {
-      const y = b[1] + j * (b[4] - b[1]);
-      for (const k of AT) {
-        const z = b[2] + k * (b[5] - b[2]);
-        if (inside(x, y, z, planes)) into[end++] = squareTo(from, x, y, z);
+  constructor({ bounds, points, area, radius }: Cell) {
+    const n = points.length / 4;
+    this.radius = Math.max(radius, NEAREST);
+    this.rows = new Float64Array(points.length);
+    this.distances = new Float64Array(n);
+    this.weights = new Float64Array(n);
+    let total = 0;
+    for (let i = 3; i < points.length; i += 4) total += points[i] as number;
+    for (let i = 0; i < points.length; i += 4) {
+      for (let axis = 0; axis < 3; axis++) {
+        const low = bounds[axis] as number;
+        const part = (points[i + axis] as number) / STEPS;
+        this.rows[i + axis] = low + part * ((bounds[axis + 3] as number) - low);
       }
+      this.rows[i + 3] = (area * (points[i + 3] as number)) / Math.max(total, 1);
     }
   }
-  return end;
+
+  look({ position, frustum, lens }: Viewpoint): Sight {
+    const { rows, radius, distances, weights } = this;
+    const [px, py, pz] = position;
+    let [solid, whole] = [0, 0];
+    for (let i = 0, at = 0; at < rows.length; i++, at += 4) {
+      const [x, y, z] = [rows[at] as number, rows[at + 1] as number, rows[at + 2] as number];
+      const area = rows[at + 3] as number;
+      let height = Infinity;
+      for (const p of frustum) height = Math.min(height, p[0] * x + p[1] * y + p[2] * z + p[3]);
+      const inside = Math.min(Math.max(0.5 + height / (2 * radius), 0), 1);
+      const square = (x - px) ** 2 + (y - py) ** 2 + (z - pz) ** 2;
+      const away = Math.max(Math.sqrt(square), NEAREST);
+      distances[i] = away;
+      weights[i] = area * inside;
+      whole += area / away ** 2;
+      solid += (area * inside) / away ** 2;
+    }
+    const unit = 1 / (4 * lens[0] * lens[1]);
+    const distance = solid > 0 ? percentile([this], PERCENTILE) : Number.NaN;
+    return { visible: solid > 0, distance, apparent: unit * solid, potential: unit * whole };
+  }
+
+  /** Distance of a label as a whole, whose cells have looked; NaN: out of sight. */
+  static together(cells: readonly Points[]): number {
+    return percentile(cells, LABEL_PERCENTILE);
+  }
+
+  /** Appends its points in sight as distance and weight. */
+  append(into: [number, number][]): void {
+    for (let i = 0; i < this.weights.length; i++) {
+      const weight = this.weights[i] as number;
+      if (weight > 0) into.push([this.distances[i] as number, weight]);
+    }
+  }
 }
 
-function inside(x: number, y: number, z: number, planes: readonly Plane[]): boolean {
-  for (const p of planes) if (p[0] * x + p[1] * y + p[2] * z + p[3] < 0) return false;
-  return true;
-}
-
-const squareTo = (p: Vec3, x: number, y: number, z: number): number =>
-  (x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2;
-
-const middle = (b: Box, axis: number): number => ((b[axis] as number) + (b[axis + 3] as number)) / 2;
-
-const halfDiagonal = (b: Box): number => Math.sqrt(squareTo([b[0], b[1], b[2]], b[3], b[4], b[5])) / 2;
-
-/** Percentile of distances, given their squares, with linear interpolation. */
-function percentile(squares: Float64Array): number {
-  squares.sort();
-  const rank = PERCENTILE * (squares.length - 1);
-  const low = Math.sqrt(squares[Math.floor(rank)] as number);
-  const high = Math.sqrt(squares[Math.ceil(rank)] as number);
-  return low + (high - low) * (rank - Math.floor(rank));
+/** The first distance up to which there is this part of the weights; NaN without any. */
+function percentile(cells: readonly Points[], part: number): number {
+  const all: [number, number][] = [];
+  for (const cell of cells) cell.append(all);
+  all.sort((a, b) => a[0] - b[0]);
+  const total = all.reduce((sum, [, weight]) => sum + weight, 0);
+  let sum = 0;
+  for (const [distance, weight] of all) {
+    sum += weight;
+    if (sum >= part * total) return distance;
+  }
+  return Number.NaN;
 }

@@ -3,24 +3,19 @@
  * documented in src/sagesplat/adapt/fill.py; tests/data/plans.json (mode "fill") checks both.
  */
 
-import type { Table } from "./knapsack";
+import type { Table } from "./allocate";
+import { climb, type Segment } from "./hull";
 
 const SLACK = 0.004;
-
-interface Upgrade {
-  readonly label: number;
-  readonly to: number; // level
-  readonly slope: number; // gain per cost
-}
 
 /**
  * Adds upgrades until the composition is hardly worse than equal levels of the same cost.
  *
- * @param levels - from 0, the least that each label gets
- * @param quality - mean quality by label and level, never falling; NaN: unknown, the label stays
+ * @param levels - from 0, the least that each row, a cell or label, gets
+ * @param quality - mean quality by row and level, never falling; NaN: unknown, the row stays
  * @param cost - Infinity for an unavailable level, above all others; such levels count as the last one there is
- * @param weight - 0: the label stays
- * @returns a level per label
+ * @param weight - 0: the row stays
+ * @returns a level per row
  */
 export function fill(
   levels: readonly number[],
@@ -41,15 +36,22 @@ export function fill(
   );
   let { bytes, value } = totals(rows, found);
   if (reached(bytes, value, uniform, total)) return found;
-  const upgrades = rows.flatMap((row, label) => hull(row, found[label] ?? 0, label));
-  // the sort is stable: of equal slopes the lower label comes first, and a label's own stay in order
-  for (const { label, to } of upgrades.sort((a, b) => (a.slope === b.slope ? 0 : b.slope - a.slope))) {
-    const [row, before] = [rows[label] as Row, found[label] as number];
-    bytes += at(row.cost, to) - at(row.cost, before);
-    value += at(row.value, to) - at(row.value, before);
-    found[label] = to;
-    if (reached(bytes, value, uniform, total)) break;
-  }
+  let isDone = false;
+  const take = ({ row, to }: Segment) => {
+    if (isDone) return false;
+    const [{ cost, value: values }, before] = [rows[row] as Row, found[row] as number];
+    bytes += at(cost, to) - at(cost, before);
+    value += at(values, to) - at(values, before);
+    found[row] = to;
+    isDone = reached(bytes, value, uniform, total);
+    return true;
+  };
+  climb(
+    rows.map(({ cost }) => cost),
+    rows.map(({ value }) => value),
+    found,
+    take,
+  );
   return found;
 }
 
@@ -91,24 +93,6 @@ function reached(
     ? from.value + ((bytes - from.bytes) / (to.bytes - from.bytes)) * (to.value - from.value)
     : to.value;
   return value / total >= curve / total - SLACK;
-}
-
-/** The segments of the upper concave hull of value over cost, from a level on. */
-function hull({ cost, value }: Row, from: number, label: number): Upgrade[] {
-  const found: Upgrade[] = [];
-  for (let level = from; level >= 0; ) {
-    let best: Upgrade & { more: number; gain: number } = { label, to: -1, slope: 0, more: 0, gain: 0 };
-    for (let to = level + 1; to < cost.length; to++) {
-      const [more, gain] = [at(cost, to) - at(cost, level), at(value, to) - at(value, level)];
-      if (!(gain > 0)) continue;
-      const slope = more > 0 ? gain / more : Infinity;
-      const better = more < best.more || (more === best.more && gain > best.gain);
-      if (slope > best.slope || (slope === best.slope && better)) best = { label, to, slope, more, gain };
-    }
-    if (best.to >= 0) found.push(best);
-    level = best.to;
-  }
-  return found;
 }
 
 const at = (values: readonly number[], i: number): number => values[i] as number;

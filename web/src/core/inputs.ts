@@ -10,12 +10,13 @@ export function normalised(settings: Settings): Settings {
     ...settings,
     budget: { bytes: limit(bytes), gpuBytes: limit(gpuBytes), count: limit(count) },
     cacheBytes: limit(settings.cacheBytes),
+    aroundBytes: Math.max(settings.aroundBytes, 0) || 0,
   };
 }
 
 /** Whether two viewpoints are equal. */
 export function same(a: Viewpoint, b: Viewpoint): boolean {
-  const numbers = (v: Viewpoint) => [...v.position, ...v.direction, ...v.frustum.flat(), v.focal];
+  const numbers = (v: Viewpoint) => [...v.position, ...v.direction, ...v.frustum.flat(), ...v.lens, v.focal];
   const [x, y] = [numbers(a), numbers(b)];
   return x.length === y.length && x.every((value, i) => value === y[i]);
 }

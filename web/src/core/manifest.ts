@@ -2,14 +2,19 @@
 
 import root from "../../../src/sagesplat/viewer/manifest.schema.json";
 import {
+  type Cell,
+  type CellPromises,
   type Label,
   type LabelPromises,
+  type Level,
   type Manifest,
   type Promises,
   QUALITIES,
   type Quality,
 } from "../types";
 import type { Fetch } from "./download";
+import { filesOf } from "./pack";
+import { levelsOf } from "./quality";
 import { BundleError, checked, refuse, type Schema } from "./schema";
 
 /** The version of the format that this viewer reads. */
@@ -32,32 +37,35 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
     );
   }
   const found = checked<Manifest>(value, root, file);
-  const ids = new Set(found.labels.map(({ id }) => id));
-  const twice = ids.size < found.labels.length ? ["labels have the same id twice"] : [];
   refuse(
-    [...twice, ...found.labels.flatMap(labelDefects), ...streamDefects(found), ...packDefects(found)],
+    [
+      ...(repeats(found.labels) ? ["labels have the same id twice"] : []),
+      ...(repeats(found.labels.flatMap(({ cells }) => cells)) ? ["cells have the same id twice"] : []),
+      ...found.labels.flatMap(labelDefects),
+      ...streamDefects(found),
+      ...packDefects(found),
+    ],
     file,
   );
   return found;
 }
+
+const repeats = (all: readonly { readonly id: number }[]): boolean =>
+  new Set(all.map(({ id }) => id)).size < all.length;
 
 /** The qualities that some label of a bundle is known by. */
 export const qualitiesOf = ({ labels }: Manifest): Quality[] =>
   QUALITIES.filter((quality) => labels.some((one) => one.quality[quality]));
 
 function labelDefects(one: Label, i: number): string[] {
-  const wrong: string[] = [];
-  const { levels, boxes } = one;
-  if (levels[0]?.refine) wrong.push(`labels[${i}].levels[0] has nothing to replace`);
-  if (boxes.some((b) => b[0] > b[3] || b[1] > b[4] || b[2] > b[5])) {
-    wrong.push(`labels[${i}].boxes has one whose least is above its most`);
-  }
+  const wrong = one.cells.flatMap((cell, j) => cellDefects(cell, `labels[${i}].cells[${j}]`));
+  const most = levelsOf(one);
   for (const quality of QUALITIES) {
     const known = one.quality[quality];
     if (!known) continue;
     const path = `labels[${i}].quality.${quality}`;
-    if (!isRising(known.levels) || (known.levels.at(-1) ?? 0) > levels.length) {
-      wrong.push(`${path}.levels must rise, up to ${levels.length}`);
+    if (!isRising(known.levels) || (known.levels.at(-1) ?? 0) > most) {
+      wrong.push(`${path}.levels must rise, up to ${most}`);
     }
     for (const values of [known.mean, known.bound ?? known.mean]) {
       if (values.length !== known.levels.length) wrong.push(`${path} must have a number a level`);
@@ -66,40 +74,62 @@ function labelDefects(one: Label, i: number): string[] {
   return wrong;
 }
 
-/** Streams have one file a label, whose levels are ranges without gaps. */
+function cellDefects({ levels, bounds, points }: Cell, path: string): string[] {
+  const wrong: string[] = [];
+  if (levels[0]?.refine) wrong.push(`${path}.levels[0] has nothing to replace`);
+  if (bounds[0] > bounds[3] || bounds[1] > bounds[4] || bounds[2] > bounds[5]) {
+    wrong.push(`${path}.bounds has a least above its most`);
+  }
+  if (points.length % 4) wrong.push(`${path}.points must have four numbers a point`);
+  return wrong;
+}
+
+/** A cell's levels are consecutive ranges of one file, or files; those of a label's cells fill theirs. */
 function streamDefects({ labels }: Manifest): string[] {
-  const uris = new Set<string>();
-  return labels.flatMap((one, i) => {
-    const path = `labels[${i}].levels`;
-    const files = one.levels;
-    const streams = files.filter(({ format }) => format === "stream");
-    const odd = (what: string) => [`${path} ${what}`];
-    if (!streams.length) {
-      const is = files.some(({ offset, weight }) => offset !== undefined || weight !== undefined);
-      return is ? odd("have offsets or weights, which only streams have") : [];
+  const others = new Set<string>(); // files of the labels before
+  return labels.flatMap(({ cells }, i) => {
+    const wrong: string[] = [];
+    const ranges: Level[] = [];
+    for (const [j, { levels }] of cells.entries()) {
+      const odd = (what: string) => wrong.push(`labels[${i}].cells[${j}].levels ${what}`);
+      const uri = levels[0]?.uri ?? "";
+      if (!levels.some(({ format }) => format === "stream")) {
+        const is = levels.some(({ offset, weight }) => offset !== undefined || weight !== undefined);
+        if (is) odd("have offsets or weights, which only streams have");
+        continue;
+      }
+      ranges.push(...levels);
+      if (levels.some((l) => l.uri !== uri || l.format !== "stream" || l.refine) || others.has(uri)) {
+        odd("must be one stream, in a file of the label's own");
+      }
+      const touch = levels.every(({ offset = Number.NaN }, k) => {
+        const below = levels[k - 1];
+        return offset === (below ? (below.offset ?? 0) + below.bytes : offset);
+      });
+      if (!touch) odd("must be ranges without gaps");
+      const weights = levels.filter(({ weight }) => weight !== undefined).length;
+      if (weights && weights < levels.length) odd("must all have a weight, or none");
     }
-    const uri = streams[0]?.uri ?? "";
-    if (files.some((file) => file.uri !== uri || file.format !== "stream" || file.refine) || uris.has(uri)) {
-      return odd("must be one stream of their own");
+    const ends = new Map<string, number>();
+    for (const { uri, offset, bytes } of ranges.sort((a, b) => (a.offset ?? 0) - (b.offset ?? 0))) {
+      if (offset !== (ends.get(uri) ?? 0) && !wrong.length) {
+        wrong.push(`labels[${i}].cells must have ranges that fill their file, from byte 0 on`);
+      }
+      ends.set(uri, (offset ?? 0) + bytes);
     }
-    uris.add(uri);
-    let end = 0;
-    const touch = files.every(({ offset, bytes }) => {
-      end += bytes;
-      return offset === end - bytes;
-    });
-    if (!touch) return odd("must be ranges of their stream without gaps, from byte 0 on");
-    const weights = files.filter(({ weight }) => weight !== undefined).length;
-    return weights && weights < files.length ? odd("must all have a weight, or none") : [];
+    for (const uri of ends.keys()) others.add(uri);
+    return wrong;
   });
 }
 
-function packDefects({ pack, labels }: Manifest): string[] {
+function packDefects(manifest: Manifest): string[] {
+  const { pack } = manifest;
   if (!pack) return [];
-  const files = pack.order.map(([i, k]) => labels[i]?.levels[k - 1]);
-  const bytes = files.reduce((sum, file) => sum + (file?.bytes ?? Number.NaN), 0);
-  const once = new Set(pack.order.map((one) => one.join())).size === files.length;
-  return bytes === pack.bytes && once ? [] : ["pack.order must name levels that fill pack.bytes, each once"];
+  const files = filesOf(manifest);
+  const bytes = files.reduce((sum, file) => sum + file.bytes, 0);
+  const once = new Set(pack.order.map((one) => one.join())).size === pack.order.length;
+  const good = bytes === pack.bytes && once && files.length === pack.order.length;
+  return good ? [] : ["pack.order must name levels that fill pack.bytes, each once"];
 }
 
 /** Parses the viewpoint models of a quality. Throws a BundleError in one line if they are invalid. */
@@ -108,6 +138,8 @@ export function parsePromises(json: string, file: string, quality: Quality): Pro
   const shared = found.views[0]?.length ?? 0;
   const even = [found.views, found.photos].every((all) => all.every((one) => one.length === all[0]?.length));
   refuse(even ? [] : ["views and photos must have columns of equal length"], file);
+  const whole = found.labels.every(({ cells }) => cells.every(({ id }) => id < 0 === (quality === "ssim")));
+  refuse(whole ? [] : ["labels have models of cells for fidelity, of the whole label for ssim"], file);
   refuse(found.quality === quality ? [] : [`quality must be ${JSON.stringify(quality)}`], file);
   refuse(
     found.screens[0] <= found.screens[1] ? [] : ["screens must be from the smaller to the larger"],
@@ -121,25 +153,38 @@ export function parsePromises(json: string, file: string, quality: Quality): Pro
 }
 
 function modelDefects(one: LabelPromises, shared: number): string[] {
-  const [n, K] = [one.views.length, one.levels.length];
-  const lists = [one.logDistances.steps, one.corrections, ...one.values.steps];
-  const fit =
-    lists.every((values) => values.length === n) &&
-    [one.offsets, one.values.units, one.values.steps].every((values) => values.length === K) &&
-    (one.curves.length === K || !one.curves.length) &&
-    one.shares.length === shared &&
-    total(one.views) < shared &&
-    [one.thresholds, one.slopes].every((values) => values.length === one.targets.length);
-  if (!fit) return [" has lists that do not fit together"];
-  const wrong: string[] = [];
-  if (!isRising(one.levels)) wrong.push(".levels must rise");
+  const wrong = one.cells.flatMap((own, j) =>
+    cellModelDefects(own, shared).map((what) => `.cells[${j}]${what}`),
+  );
+  if (repeats(one.cells)) wrong.push(".cells have the same id twice");
+  if ([one.thresholds, one.slopes].some((values) => values.length !== one.targets.length)) {
+    wrong.push(" has lists that do not fit together");
+  }
   if (!isRising(one.targets) || !below(one.targets, WHOLE)) {
     wrong.push(".targets must rise, from -1 to 1");
   }
   if (!below(one.thresholds, MOST) || !below(one.slopes, MOST))
     wrong.push(" has thresholds or slopes out of range");
-  if (!within(one.shares, WHOLE) || !within(one.corrections, 1e5))
-    wrong.push(" has shares or corrections out of range");
+  return wrong;
+}
+
+function cellModelDefects(one: CellPromises, shared: number): string[] {
+  const [n, K] = [one.views.length, one.levels.length];
+  const { factors = [], corrections = [], curves = [], shares = [] } = one;
+  const has = (list: readonly number[], length: number) => list.length === length || !list.length;
+  const fit =
+    [one.logDistances.steps, ...one.values.steps].every((values) => values.length === n) &&
+    [one.offsets, one.values.units, one.values.steps].every((values) => values.length === K) &&
+    (curves.length === K || !curves.length) &&
+    has(factors, shared) &&
+    has(shares, shared) &&
+    has(corrections, n) &&
+    (total(one.views) < shared || !n);
+  if (!fit) return [" has lists that do not fit together"];
+  const wrong: string[] = [];
+  if (!isRising(one.levels)) wrong.push(".levels must rise");
+  if (!within(factors, 1e6) || !within(corrections, 1e5) || !within(shares, WHOLE))
+    wrong.push(" has factors, shares or corrections out of range");
   const logs = one.logDistances;
   if (!within(logs.steps, 100 / logs.unit) || one.values.steps.some((row) => !within(row, MOST))) {
     wrong.push(" has values out of range");

@@ -12,20 +12,22 @@ const LEAST = 1e-6;
 /** Bytes of first levels out of sight that precede all finer levels, so that turning shows no holes. */
 const NEARBY = 2 ** 18;
 
-/** Assumed probability that the viewer soon turns to a label out of sight. */
+/** Assumed probability that the viewer soon turns to a cell out of sight. */
 const TURN = 0.25;
 
 /**
  * The increments of a path from `have` on with their values. Since they must come in order, an increment
  * counts with the slope of the concave hull of SSIM over bytes.
  *
+ * @param files - increments by level of the cell
  * @param path - levels of the increments on the way to the planned level
  * @param have - how many of them are there
- * @param weight - of the label in the picture
+ * @param weight - of the cell in the picture
  * @param shown - level whose quality there is already
  */
 export function steps(
-  c: Candidate,
+  c: Pick<Candidate, "mean" | "ladder">,
+  files: readonly File[],
   path: readonly number[],
   have: number,
   weight: number,
@@ -33,7 +35,7 @@ export function steps(
 ): Step[] {
   const { q, c: bytes } = known([c.mean], [c.ladder.bytes]);
   const quality = path.map((level) => q[0]?.[level - 1] ?? 0);
-  const sums = sumsOf(c, path);
+  const sums = sumsOf(files, path);
   const found: Step[] = [];
   let from = have;
   let last = Infinity;
@@ -57,9 +59,9 @@ export function steps(
 }
 
 /** Bytes of the first 0, 1, ... increments of a path. */
-function sumsOf({ label }: Candidate, path: readonly number[]): number[] {
+function sumsOf(files: readonly File[], path: readonly number[]): number[] {
   let sum = 0;
-  return [0, ...path.map((level) => (sum += label.levels[level - 1]?.bytes ?? 0))];
+  return [0, ...path.map((level) => (sum += files[level - 1]?.bytes ?? 0))];
 }
 
 interface Wanted {
@@ -69,7 +71,7 @@ interface Wanted {
 }
 
 /**
- * The missing files of the plan, in order: first levels in sight and of nearby labels, the viewpoint models,
+ * The missing files of the plan, in order: first levels in sight and of cells nearby, the viewpoint models,
  * then increments by gain per byte. The viewpoint models come last if the plan does not depend on them.
  */
 export function inOrder(
@@ -88,10 +90,10 @@ export function inOrder(
     const isHere = ({ file, level }: { file: File; level: number }) =>
       entry.has(level) || entry.decoding === level || downloads.isHere(file);
     const have = files.findIndex((one) => !isHere(one));
-    const lowest = entry.label.levels[0];
+    const lowest = entry.cell.levels[0];
     if (!candidate || !lowest || !first) continue;
     const weight = visibleWeight(candidate);
-    let most = Infinity; // keeps the levels of a label in order
+    let most = Infinity; // keeps the levels of a cell in order
     if (!candidate.visible) {
       most = (TURN * potentialWeight(candidate) * (candidate.mean[0] || 1)) / Math.max(lowest.bytes, 1);
       const missing = first === 1 && have === 0 && !downloads.isBackingOff(lowest);
@@ -101,7 +103,7 @@ export function inOrder(
     const { steps: told } = entry;
     if (told?.candidate !== candidate || told.have !== have || told.first !== first) {
       const path = files.map(({ level }) => level);
-      const found = steps(candidate, path, have, weight, first > 1 ? entry.shown : 0);
+      const found = steps(candidate, entry.cell.levels, path, have, weight, first > 1 ? entry.shown : 0);
       entry.steps = { candidate, have, first, found };
     }
     let at = have;
@@ -127,7 +129,7 @@ const best = (list: readonly Wanted[]): File[] =>
     .sort((a, b) => b.value - a.value)
     .map(({ file }) => file);
 
-/** Splits labels into the best up to `NEARBY` bytes, with those already loaded, and the others. */
+/** Splits cells into the best up to `NEARBY` bytes, with those already loaded, and the others. */
 function divided(list: readonly Wanted[]): [Wanted[], Wanted[]] {
   const sorted = [...list].sort((a, b) => b.value - a.value);
   let bytes = 0;

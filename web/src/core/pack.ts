@@ -1,6 +1,6 @@
 /** The pack of a bundle: its increments as one stream, each usable as soon as it is complete. */
 
-import type { Manifest } from "../types";
+import type { Level, Manifest } from "../types";
 import { DamagedError, DownloadError, type File, type Link, type Reply, receive } from "./download";
 import { Cutter } from "./ranges";
 
@@ -8,8 +8,10 @@ import { Cutter } from "./ranges";
 const SILENCE = 3000;
 
 /** The increments in a manifest's pack, in their order. */
-export const filesOf = ({ pack, labels }: Manifest): File[] =>
-  (pack?.order ?? []).flatMap(([label, level]) => labels[label]?.levels[level - 1] ?? []);
+export function filesOf({ pack, labels }: Manifest): Level[] {
+  const cells = new Map(labels.flatMap((label) => label.cells.map(({ id, levels }) => [id, levels])));
+  return (pack?.order ?? []).flatMap(([id, level]) => cells.get(id)?.[level - 1] ?? []);
+}
 
 /** Concurrent requests of a browser without HTTP/2. */
 const CONNECTIONS = 6;

@@ -2,12 +2,13 @@
 
 import type { Vec3 } from "../types";
 
-/** The splats of a label in main memory: four words each, in the order of its levels. */
+/** The splats of a label, or of one of its cells, in main memory: four words each, in the order of levels. */
 export interface Packed {
   readonly label: number;
+  readonly first?: number; // rank in the label of the first one
   readonly words: Uint32Array;
   readonly count: number;
-  readonly hidden?: Uint8Array; // splats that are not shown, by rank
+  readonly hidden?: Uint8Array; // splats that are not shown
 }
 
 export interface Encoding {
@@ -47,7 +48,7 @@ const HALVES = (() => {
   return table;
 })();
 
-const half = (bits: number): number => HALVES[bits & 0xffff] as number;
+export const half = (bits: number): number => HALVES[bits & 0xffff] as number;
 
 export function positionOf(words: Uint32Array, rank: number): [number, number, number] {
   const [xy, z] = [words[4 * rank + 1] as number, words[4 * rank + 2] as number];
@@ -132,7 +133,12 @@ export function pick(clouds: readonly Packed[], encoding: Encoding, ray: Ray): P
 }
 
 /** Adds the splats of a label that a ray meets. */
-function meet({ label, words, count, hidden }: Packed, scales: Float64Array, ray: Ray, hits: Hit[]): void {
+function meet(
+  { label, first = 0, words, count, hidden }: Packed,
+  scales: Float64Array,
+  ray: Ray,
+  hits: Hit[],
+): void {
   const [ox, oy, oz] = ray.origin;
   const [dx, dy, dz] = ray.direction;
   const [fx, fy, fz] = ray.forward;
@@ -151,7 +157,7 @@ function meet({ label, words, count, hidden }: Packed, scales: Float64Array, ray
     if (x * x + y * y + z * z - along * along > reach * reach || hidden?.[rank]) continue;
     const opacity = ((words[at] as number) >>> 24) / 255;
     const alpha = opacity * response(words, rank, scales, [x, y, z], ray.direction, blur * depth);
-    if (alpha >= LEAST) hits.push({ label, rank, depth, alpha: Math.min(alpha, 0.99) });
+    if (alpha >= LEAST) hits.push({ label, rank: first + rank, depth, alpha: Math.min(alpha, 0.99) });
   }
 }
 

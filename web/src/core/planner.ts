@@ -1,24 +1,31 @@
-/** Plans the level of each label from settings and a viewpoint. Levels are 1-based, 0 is nothing. */
+/** Plans the level of each cell from settings and a viewpoint. Levels are 1-based, 0 is nothing. */
 
-import type { Budget, Label, Settings } from "../types";
-import { type Allocation, bestWithin, cheapest } from "./allocate";
+import type { Budget, Level, Settings } from "../types";
+import { cheapest, together } from "./allocate";
 import { fill } from "./fill";
+import { climb, nextSegment, type Segment } from "./hull";
 
-/** The planner's input for one label. */
+/** The planner's input for a cell, or for a label all of whose cells have one level. */
 export interface Candidate {
-  readonly label: Label;
-  readonly always?: boolean; // instead of the label\'s
   readonly ladder: Ladder;
   readonly highest: number; // highest available level; lower if an increment is damaged
   readonly mean: readonly number[]; // by level, quality; NaN: unknown
-  readonly bound: readonly number[];
   readonly weight: number; // of the label, set by the user
-  readonly share: number; // pixel share; out of sight the one that it would have
+  readonly always: boolean; // in full
+  readonly share: number; // pixel share; 0: out of sight
+  readonly potential: number; // apparent size if all of it were in sight
   readonly visible: boolean;
   readonly previous: number; // level in the previous plan, 0: none
 }
 
-/** Total costs of a label's levels. */
+/** The cells of a label, and what it takes to reach the target. */
+export interface Group {
+  readonly cells: readonly Candidate[];
+  readonly needed: number; // mean quality over its pixels; NaN: no promise is possible
+  readonly bound?: readonly number[]; // by level, of a label that is planned as a whole; instead of `needed`
+}
+
+/** Total costs of the levels of a cell. */
 export interface Ladder {
   readonly bytes: readonly number[];
   readonly gpuBytes: readonly number[];
@@ -26,20 +33,21 @@ export interface Ladder {
 }
 
 export interface Plan {
-  readonly wanted: readonly number[]; // level per candidate
+  readonly wanted: readonly (readonly number[])[]; // level by group and cell
+  readonly around: readonly (readonly number[])[]; // that which follows once everything in sight is drawn
   readonly status: "ok" | "infeasible" | "over budget";
 }
 
 const UNITS = ["bytes", "gpuBytes", "count"] as const;
 type Unit = (typeof UNITS)[number];
-const BUDGET_STEPS = 2 ** 20; // steps of a budget when several units are combined
-const LEAST_SHARE = 1e-4; // least pixel share, so that every visible label counts
+const LEAST_SHARE = 1e-4; // least pixel share, so that every visible cell counts
+const SLACK = 0.01; // least gain of quality for which a budget's levels are left
 
 /** Costs of levels as sums over their increments, from the newest that replaces those below. */
-export function ladderOf(label: Label): Ladder {
+export function ladderOf({ levels }: { readonly levels: readonly Level[] }): Ladder {
   const sums = (unit: Unit) => {
     let sum = 0;
-    return label.levels.map((level) => {
+    return levels.map((level) => {
       sum = level[unit] + (level.refine ? 0 : sum);
       return sum;
     });
@@ -47,153 +55,203 @@ export function ladderOf(label: Label): Ladder {
   return { bytes: sums("bytes"), gpuBytes: sums("gpuBytes"), count: sums("count") };
 }
 
-/** Weight of a label at this viewpoint. */
-export const visibleWeight = (c: Candidate): number => (c.visible ? potentialWeight(c) : 0);
+/** Weight of a cell at this viewpoint. */
+export const visibleWeight = (c: Candidate): number =>
+  c.visible ? c.weight * Math.max(c.share, LEAST_SHARE) : 0;
 
-/** The same, as if the label were in sight. */
-export const potentialWeight = (c: Candidate): number => c.weight * Math.max(c.share, LEAST_SHARE);
+/** The same, as if the cell were in sight. */
+export const potentialWeight = (c: Candidate): number => c.weight * Math.max(c.potential, LEAST_SHARE);
 
-const isAlways = (c: Candidate): boolean => c.always ?? c.label.always;
+/** A cell while it is planned. */
+interface Row {
+  readonly c: Candidate;
+  level: number; // from 0; -1: left out
+}
 
 /** The planned levels, within the budget in all units; the smallest composition if nothing fits. */
-export function makePlan(candidates: readonly Candidate[], settings: Settings): Plan {
-  const there = withoutFar(
-    candidates.filter((c) => c.highest > 0),
-    settings.budget,
+export function makePlan(groups: readonly Group[], settings: Settings): Plan {
+  const all = groups.map(({ cells }) =>
+    cells.map((c): Row => ({ c, level: c.highest > 0 ? (c.always ? c.highest - 1 : 0) : -1 })),
   );
-  const fixed = there.filter((c) => isAlways(c));
-  const free = there.filter((c) => !isAlways(c));
-  const left = lessen(settings.budget, fixed);
-  const found = free.length ? choose(free, settings, left) : { levels: [], status: statusOf(left) };
-  const levels = new Map(free.map((c, i) => [c, (found.levels[i] ?? 0) + 1]));
-  for (const c of fixed) levels.set(c, c.highest);
-  return { wanted: candidates.map((c) => levels.get(c) ?? 0), status: found.status };
+  leaveOut(all.flat(), settings.budget);
+  const there = all.flat().filter(({ level }) => level >= 0);
+  const free = there.filter(({ c }) => !c.always);
+  const left = lessen(
+    settings.budget,
+    there.filter(({ c }) => c.always),
+  );
+  const status = choose(groups, all, free, settings, left);
+  const listed = () => all.map((rows) => rows.map(({ level }) => level + 1));
+  const wanted = listed();
+  raise(free, settings, left);
+  return { wanted, around: listed(), status };
 }
 
-/**
- * Removes per-block categories out of sight that do not fit even at their first level, least weight first.
- * Labels in sight stay, as do all labels of a scene without blocks.
- */
-function withoutFar(all: readonly Candidate[], budget: Budget): readonly Candidate[] {
-  const least = (c: Candidate) => (isAlways(c) ? c.highest : 1) - 1;
-  const over = { ...budget };
-  for (const unit of UNITS) for (const c of all) over[unit] -= c.ladder[unit][least(c)] ?? 0;
-  const lacks = () => UNITS.some((unit) => over[unit] < 0);
-  if (!lacks()) return all;
-  const far = all.filter((c) => c.label.block !== undefined && !c.visible && !isAlways(c));
-  const out = new Set<Candidate>();
-  for (const c of far.sort((a, b) => potentialWeight(a) - potentialWeight(b))) {
-    if (!lacks()) break;
-    out.add(c);
-    for (const unit of UNITS) over[unit] += c.ladder[unit][0] ?? 0;
+/** Leaves out cells out of sight where not even the lowest levels fit, those of least apparent size first. */
+function leaveOut(rows: readonly Row[], budget: Budget): void {
+  const over = lessen(budget, rows);
+  if (!isOver(over)) return;
+  const unseen = rows.filter(({ c, level }) => level >= 0 && !c.visible && !c.always);
+  for (const row of unseen.sort((a, b) => potentialWeight(a.c) - potentialWeight(b.c))) {
+    if (!isOver(over)) return;
+    for (const unit of UNITS) over[unit] += row.c.ladder[unit][0] ?? 0;
+    row.level = -1;
   }
-  return all.filter((c) => !out.has(c));
 }
 
-interface Chosen {
-  readonly levels: readonly number[]; // from 0
-  readonly status: Plan["status"];
-}
-
-function choose(free: readonly Candidate[], settings: Settings, budget: Budget): Chosen {
-  if (settings.mode === "budget") return within(free, budget);
-  const asked = settings.mode === "target" ? reach(free, settings) : same(free, settings.mode);
-  if (fits(free, asked.levels, budget)) return asked;
-  const { levels, status } = within(free, budget);
-  return { levels, status: status === "ok" ? "infeasible" : status };
-}
-
-function same(free: readonly Candidate[], mode: "full" | "base"): Chosen {
-  return { levels: free.map((c) => (mode === "full" ? c.highest - 1 : 0)), status: "ok" };
+/** Raises the levels of the free rows, which are the lowest, by the settings. */
+function choose(
+  groups: readonly Group[],
+  all: readonly (readonly Row[])[],
+  free: readonly Row[],
+  settings: Settings,
+  budget: Budget,
+): Plan["status"] {
+  const { mode } = settings;
+  if (mode === "budget") return within(free, budget);
+  const asked = mode === "target" ? reach(groups, all, settings) : "ok";
+  if (mode === "full") for (const row of free) row.level = row.c.highest - 1;
+  if (!isOver(lessen(budget, free))) return asked;
+  for (const row of free) row.level = 0;
+  const status = within(free, budget);
+  return status === "ok" ? "infeasible" : status;
 }
 
 /**
  * The cheapest levels that reach a target; the first level out of sight. For a target of fidelity the picture
- * as a whole is not to be worse than equal levels of all categories would be for the same bytes.
+ * as a whole is not to be worse than equal levels of all cells would be for the same bytes.
  */
-function reach(free: readonly Candidate[], { quality, target }: Settings): Chosen {
-  const levels = free.map(() => 0);
-  const seen = free.flatMap((c, i) => (c.visible && c.weight > 0 ? [{ c, i }] : []));
-  if (!seen.length) return { levels, status: "ok" };
-  const bounds = seen.map(({ c }) => c.bound);
-  const costs = seen.map(({ c }) => costOf(c, "bytes"));
-  const found = cheapest(bounds, costs, target, { previous: seen.map(({ c }) => before(c)) });
-  const weights = seen.map(({ c }) => visibleWeight(c));
-  const filled =
-    quality === "fidelity"
-      ? fill(
-          found.levels,
-          seen.map(({ c }) => c.mean),
-          costs,
-          weights,
-        )
-      : found.levels;
-  seen.forEach(({ i }, row) => {
-    levels[i] = filled[row] ?? 0;
+function reach(
+  groups: readonly Group[],
+  all: readonly (readonly Row[])[],
+  { quality, target }: Settings,
+): Plan["status"] {
+  let status: Plan["status"] = "ok";
+  const seen: Row[] = [];
+  groups.forEach(({ needed, bound }, i) => {
+    const rows = (all[i] ?? []).filter(({ c, level }) => !c.always && level >= 0 && visibleWeight(c) > 0);
+    if (!rows.length) return;
+    seen.push(...rows);
+    const cost = rows.map(({ c }) => bytesOf(c));
+    const previous = rows.map(({ c }) => before(c));
+    const isKnown = !Number.isNaN(needed) && rows.every(({ c }) => c.mean.some((q) => !Number.isNaN(q)));
+    const found = bound
+      ? cheapest([bound.slice(0, rows[0]?.c.highest)], cost, target, { previous })
+      : together(
+          { cost, mean: rows.map(({ c }) => qualityOf(c)), share: rows.map(({ c }) => c.share), previous },
+          isKnown ? needed : 1,
+        );
+    if (found.status !== "ok") status = "infeasible";
+    rows.forEach((row, k) => {
+      row.level = found.levels[k] ?? 0;
+    });
   });
-  return { levels, status: found.status };
+  if (quality !== "fidelity") return status;
+  const filled = fill(
+    seen.map(({ level }) => level),
+    seen.map(({ c }) => c.mean),
+    seen.map(({ c }) => bytesOf(c)),
+    seen.map(({ c }) => visibleWeight(c)),
+  );
+  seen.forEach((row, i) => {
+    row.level = filled[i] ?? 0;
+  });
+  return status;
 }
 
-/** The levels with the largest expected quality within the budget in every unit. */
-function within(free: readonly Candidate[], budget: Budget): Chosen {
-  const [tightest, ...others] = [...UNITS].sort((a, b) => room(free, budget, a) - room(free, budget, b));
-  const first = best(free, (c) => costOf(c, tightest as Unit), budget[tightest as Unit]);
-  if (first.status === "over budget" || others.every((unit) => fitsIn(free, first.levels, budget, unit))) {
-    return first;
+/**
+ * Upgrades by falling gain per cost, each taken if it still fits in every unit. The cost is the largest part of
+ * the budgets.
+ */
+function within(free: readonly Row[], budget: Budget): Plan["status"] {
+  const left = lessen(budget, free);
+  if (isOver(left)) return "over budget";
+  const seen = free.filter(({ c }) => visibleWeight(c) > 0);
+  const values = seen.map(({ c }) => {
+    const weight = visibleWeight(c);
+    return qualityOf(c).map((quality) => weight * quality);
+  });
+  const scale = UNITS.map((unit) => 1 / Math.max(budget[unit], 1));
+  const [bytes = 0, gpuBytes = 0, count = 0] = scale;
+  const costs = seen.map(({ c: { ladder } }, i) =>
+    (values[i] ?? []).map((_, k) =>
+      Math.max(
+        bytes * (ladder.bytes[k] ?? 0),
+        gpuBytes * (ladder.gpuBytes[k] ?? 0),
+        count * (ladder.count[k] ?? 0),
+      ),
+    ),
+  );
+  const levels = seen.map(({ level }) => level);
+  climb(costs, values, levels, (segment) => take(seen[segment.row] as Row, segment, left));
+  // earlier levels that are about as good stay
+  const earlier = seen.map(({ c }) => ({ c, level: before(c) }));
+  const value = (rows: readonly Row[]) =>
+    rows.reduce((sum, { level }, i) => sum + (values[i]?.[level] ?? Number.NaN), 0);
+  const slack = SLACK * seen.reduce((sum, { c }) => sum + visibleWeight(c), 0);
+  if (!(value(earlier) >= value(seen) - slack)) return "ok";
+  const unseen = free.filter(({ c }) => visibleWeight(c) <= 0);
+  if (isOver(lessen(budget, [...earlier, ...unseen]))) return "ok";
+  seen.forEach((row, i) => {
+    row.level = earlier[i]?.level ?? 0;
+  });
+  return "ok";
+}
+
+/** Takes a row's next segment, if it fits into what is left, which it lessens; whether it did. */
+function take(row: Row, { from, to }: Segment, left: Costs): boolean {
+  const { ladder } = row.c;
+  const more = (unit: Unit) => (ladder[unit][to] as number) - (ladder[unit][from] as number);
+  if (UNITS.some((unit) => more(unit) > left[unit])) return false;
+  for (const unit of UNITS) left[unit] -= more(unit);
+  row.level = to;
+  return true;
+}
+
+/** Raises cells out of sight, the largest first, by a segment at a time. */
+function raise(free: readonly Row[], { mode, aroundBytes }: Settings, budget: Budget): void {
+  const left = lessen(budget, free);
+  if (mode === "full" || mode === "base" || !(aroundBytes > 0) || isOver(left)) return;
+  left.bytes = Math.min(left.bytes, aroundBytes);
+  let rows = free.filter(({ c }) => !c.visible && c.weight > 0).sort((a, b) => b.c.potential - a.c.potential);
+  while (rows.length) {
+    rows = rows.filter((row) => {
+      const next = nextSegment(bytesOf(row.c), qualityOf(row.c), row.level);
+      return next && take(row, next, left);
+    });
   }
-  // the largest share over all budgets, as the cost, respects each of them
-  const largest = (c: Candidate, k: number) =>
-    Math.max(...UNITS.map((unit) => (costOf(c, unit)[k] as number) / budget[unit] || 0));
-  const joint = best(
-    free,
-    (c) => c.label.levels.map((_, k) => Math.ceil(BUDGET_STEPS * largest(c, k))),
-    BUDGET_STEPS,
-  );
-  return { levels: joint.levels, status: fits(free, joint.levels, budget) ? "ok" : "over budget" };
 }
 
-function best(
-  free: readonly Candidate[],
-  cost: (c: Candidate) => readonly number[],
-  budget: number,
-): Allocation {
-  return bestWithin(
-    free.map((c) => c.mean),
-    free.map(cost),
-    free.map(visibleWeight),
-    Math.max(budget, 0),
-    { previous: free.map(before) },
-  );
+/** Expected quality by available level: an unknown one as the one below, by the bytes if all are. */
+function qualityOf({ mean, ladder, highest }: Candidate): readonly number[] {
+  const some = highest < mean.length ? mean.slice(0, highest) : mean;
+  if (!some.some(Number.isNaN)) return some;
+  const most = ladder.bytes[highest - 1] ?? 1;
+  if (some.every(Number.isNaN)) return some.map((_, k) => Math.sqrt((ladder.bytes[k] ?? 0) / most));
+  let last = 0;
+  return some.map((quality) => {
+    if (!Number.isNaN(quality)) last = quality;
+    return last;
+  });
 }
 
 const before = (c: Candidate): number => (c.previous <= c.highest ? c.previous - 1 : -1);
 
-/** Cost by level; Infinity for unavailable levels. */
-const costOf = (c: Candidate, unit: Unit): readonly number[] =>
-  c.ladder[unit].map((cost, k) => (k < c.highest ? cost : Infinity));
+/** Bytes by available level. */
+const bytesOf = ({ ladder: { bytes }, highest }: Candidate): readonly number[] =>
+  highest < bytes.length ? bytes.slice(0, highest) : bytes;
 
-/** Budget as a share of the full model's cost. */
-function room(free: readonly Candidate[], budget: Budget, unit: Unit): number {
-  const full = free.reduce((sum, c) => sum + (c.ladder[unit][c.highest - 1] ?? 0), 0);
-  return full > 0 ? budget[unit] / full : Infinity;
+type Costs = Record<Unit, number>;
+
+const isOver = (left: Costs): boolean => left.bytes < 0 || left.gpuBytes < 0 || left.count < 0;
+
+/** A budget less what cells cost. */
+function lessen({ bytes, gpuBytes, count }: Budget, rows: readonly Row[]): Costs {
+  const left = { bytes, gpuBytes, count };
+  for (const { c, level } of rows) {
+    left.bytes -= c.ladder.bytes[level] ?? 0;
+    left.gpuBytes -= c.ladder.gpuBytes[level] ?? 0;
+    left.count -= c.ladder.count[level] ?? 0;
+  }
+  return left;
 }
-
-const fits = (free: readonly Candidate[], levels: readonly number[], budget: Budget): boolean =>
-  UNITS.every((unit) => fitsIn(free, levels, budget, unit));
-
-function fitsIn(free: readonly Candidate[], levels: readonly number[], budget: Budget, unit: Unit): boolean {
-  const cost = free.reduce((sum, c, i) => sum + (c.ladder[unit][levels[i] ?? 0] ?? 0), 0);
-  return cost <= budget[unit];
-}
-
-function lessen(budget: Budget, fixed: readonly Candidate[]): Budget {
-  const cost = (unit: Unit) => fixed.reduce((sum, c) => sum + (c.ladder[unit][c.highest - 1] ?? 0), 0);
-  return {
-    bytes: budget.bytes - cost("bytes"),
-    gpuBytes: budget.gpuBytes - cost("gpuBytes"),
-    count: budget.count - cost("count"),
-  };
-}
-
-const statusOf = (left: Budget): Plan["status"] =>
-  UNITS.every((unit) => left[unit] >= 0) ? "ok" : "over budget";

@@ -9,18 +9,6 @@ export function matern(square: number): number {
   return (1 + scaled) * Math.exp(-scaled);
 }
 
-const STEPS = 256; // of a table of it, in a unit of the scaled difference
-const TABLE = Float64Array.from({ length: 32 * STEPS }, (_, i) => matern((i / STEPS) ** 2 / 3));
-
-/** The same by a table, accurate to 2e-6: pixel shares sum over all views for each label. */
-export function maternTable(square: number): number {
-  const at = Math.sqrt(3 * square) * STEPS;
-  const i = Math.floor(at);
-  if (!(i < TABLE.length - 1)) return 0;
-  const low = TABLE[i] as number;
-  return low + (at - i) * ((TABLE[i + 1] as number) - low);
-}
-
 /** The lower half of C + NUGGET I for n views, whose inputs [n, 8] are divided by the length scales. */
 export function covariance(scaled: Float64Array, n: number): Float64Array {
   const S = new Float64Array(n * n);

@@ -1,25 +1,40 @@
 /**
- * Quality of a label at each level from any viewpoint. Same formulas as src/sagesplat/viewer/promises.py and
- * adapt/viewpoint.py; tests/data/promises.json checks them.
+ * Quality of cells at each level, and what a label keeps, from any viewpoint. Same formulas as
+ * src/sagesplat/viewer/promises.py and adapt/viewpoint.py; tests/data/promises.json checks them.
  */
 
-import type { Curve, Label, LabelPromises, Promises, Quality, Trust, Viewpoint } from "../types";
-import { covariance, matern, maternTable, solved } from "./process";
+import type {
+  CellPromises,
+  Curve,
+  Label,
+  LabelPromises,
+  LabelQuality,
+  Promises,
+  Trust,
+  Viewpoint,
+} from "../types";
+import { covariance, matern, solved } from "./process";
 
-/** The prediction for one label at one viewpoint. */
-export interface Prediction {
-  readonly mean: readonly number[]; // by level, expected quality, never falls; NaN: unknown
-  readonly bound: readonly number[]; // by level, lower confidence bound, never falls; NaN: no promise
+/** What a label keeps at a viewpoint. */
+export interface Outlook {
+  readonly keeps: Keeps | null; // null: no promise
   readonly support: number; // 1 at a known viewpoint, 0 far from all of them; NaN: no model
   readonly trust: Trust;
+}
+
+/** Ascending targets, and the mean quality from which on each is kept, which never falls. */
+export interface Keeps {
+  readonly targets: ArrayLike<number>;
+  readonly needed: ArrayLike<number>;
 }
 
 /** Where and on what screen: all that models know of a viewpoint. */
 type From = Pick<Viewpoint, "position" | "direction" | "focal">;
 
-/** Steps of positions over the extent, directions, log screens, shares, targets, thresholds and slopes. */
+/** Steps of positions over the extent, directions, log screens, targets, thresholds and slopes. */
 const STEP = 1e-4;
 const CORRECTION_STEP = 5e-3;
+const FACTOR_STEP = 0.05;
 
 /** Eq. 3 at a distance, clamped to the fitted range; the median for an unknown distance (NaN). */
 export function curveAt(curve: Curve, distance: number): number {
@@ -31,17 +46,40 @@ export function curveAt(curve: Curve, distance: number): number {
   return clip(K * Math.exp(-g * Math.abs(d - mu) ** a));
 }
 
-/** What is known whatever the viewpoint, until the viewpoint models are loaded. */
-export function anywhere(label: Label, quality: Quality): Prediction {
-  const unknown = label.levels.map(() => Number.NaN);
-  const known = label.quality[quality];
-  if (!known) return { mean: unknown, bound: unknown, support: Number.NaN, trust: "unknown" };
-  return {
-    mean: spread(rising(known.mean), known.levels, unknown),
-    bound: known.bound ? spread(running(known.bound, Math.max), known.levels, unknown) : unknown,
-    support: Number.NaN,
-    trust: known.bound ? known.status : "unknown",
-  };
+/** The mean quality that a target needs: linear between targets; Infinity beyond the last one. */
+export function neededFor({ targets, needed }: Keeps, target: number): number {
+  const last = targets.length - 1;
+  if (!(last >= 0) || target > at(targets, last)) return Infinity;
+  let above = 0;
+  while (at(targets, above) < target) above += 1;
+  const [t1, m1] = [at(targets, above), at(needed, above)];
+  if (above === 0) return m1 - (t1 - target);
+  const [t0, m0] = [at(targets, above - 1), at(needed, above - 1)];
+  return m0 + ((m1 - m0) / (t1 - t0)) * (target - t0);
+}
+
+/** The largest target that a mean keeps, between targets interpolated. */
+export function boundOf({ targets, needed }: Keeps, mean: number): number {
+  const last = targets.length - 1;
+  if (Number.isNaN(mean) || last < 0) return Number.NaN;
+  let above = 0;
+  while (above <= last && at(needed, above) <= mean) above += 1;
+  if (above > last) return at(targets, last);
+  const [t1, m1] = [at(targets, above), at(needed, above)];
+  if (above === 0) return mean + (t1 - m1);
+  const [t0, m0] = [at(targets, above - 1), at(needed, above - 1)];
+  return t0 + ((t1 - t0) / (m1 - m0)) * (mean - m0);
+}
+
+/** What is known whatever the viewpoint, until the viewpoint models are loaded: means of so many levels. */
+export function meansAnywhere(known: LabelQuality | undefined, levels: number): number[] {
+  return known ? spread(rising(known.mean), known.levels, levels) : spread([], [], levels);
+}
+
+export function outlookAnywhere(known: LabelQuality | undefined): Outlook {
+  if (!known?.bound) return { keeps: null, support: Number.NaN, trust: "unknown" };
+  const keeps = { targets: running(known.bound, Math.max), needed: rising(known.mean) };
+  return { keeps, support: Number.NaN, trust: known.status };
 }
 
 /** Exponent of the kernel weights in `corrected`, and the weight at which a correction counts by half. */
@@ -50,17 +88,17 @@ const HALF_WEIGHT = 1e-3;
 
 const COLUMNS = 7; // of the shared views: position over the extent, direction, log screen
 const PHOTO_COLUMNS = 6; // of the photos: without the screen
-const PHOTO_LENGTHS = [0.3, 0.5] as const; // of position and direction, for how far one is from the photos
+const PLACE_LENGTHS = [0.3, 0.5] as const; // of position and direction, for photos and factors
 
 /** The views that the models of all labels share, and how far they are from the current viewpoint. */
 export class Views {
   readonly away: Float64Array; // [V] square of the distance over the extent
   readonly turned: Float64Array; // [V] square of the difference of the directions
   readonly rescaled: Float64Array; // [V] square of the difference of the log screens
+  readonly alike: Float64Array; // [V] of place: 1 at the view
   readonly rows: Float64Array; // [V, COLUMNS]
   private readonly photos: Float64Array; // [P, PHOTO_COLUMNS]
   fromPhotos = Number.NaN; // of the current viewpoint: 0 at a photo, 1 far from all; NaN: none are known
-  private last: From | null = null;
 
   constructor(private readonly sent: Pick<Promises, "views" | "photos" | "extent" | "focal" | "screens">) {
     this.rows = byRow(sent.views);
@@ -69,23 +107,25 @@ export class Views {
     this.away = new Float64Array(count);
     this.turned = new Float64Array(count);
     this.rescaled = new Float64Array(count);
+    this.alike = new Float64Array(count);
   }
 
   /** Computes the differences from a viewpoint, once for all labels. */
   from(viewpoint: From): void {
-    if (viewpoint === this.last) return;
-    this.last = viewpoint;
     const { rows, sent } = this;
     const [x, y, z] = viewpoint.position.map((p) => p / sent.extent) as [number, number, number];
     const [a, b, c] = viewpoint.direction;
     const [smallest, largest] = sent.screens;
     const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), smallest), largest));
+    const [position, direction] = PLACE_LENGTHS;
     for (let i = 0, at = 0; i < this.away.length; i++, at += COLUMNS) {
-      this.away[i] = square(x, y, z, rows, at);
-      this.turned[i] = square(a, b, c, rows, at + 3);
+      const away = square(x, y, z, rows, at);
+      const turned = square(a, b, c, rows, at + 3);
+      this.away[i] = away;
+      this.turned[i] = turned;
       this.rescaled[i] = (screen - (rows[at + 6] as number)) ** 2;
+      this.alike[i] = matern(away / position ** 2 + turned / direction ** 2);
     }
-    const [position, direction] = PHOTO_LENGTHS;
     let least = Infinity;
     for (let at = 0; at < this.photos.length; at += PHOTO_COLUMNS) {
       const away = square(x, y, z, this.photos, at) / position ** 2;
@@ -117,75 +157,64 @@ function square(x: number, y: number, z: number, rows: Float64Array, at: number)
   return dx * dx + dy * dy + dz * dz;
 }
 
-/** A label's viewpoint model; its weights are solved for when the label is first in sight. */
-export class ViewModel {
+/** Factors of squares that divide inputs by their length scales: position, direction, log screen, log distance. */
+const scalesOf = ({ lengths }: LabelPromises) =>
+  lengths.map((length) => length ** -2) as [number, number, number, number];
+
+/** The viewpoint model of a cell, or of a label as a whole; its weights are solved for when it is first in sight. */
+export class CellModel {
   private weights: Float64Array | null = null; // [K, n]
   private readonly own: Int32Array; // [n] rows of the shared views
   private readonly logDistances: Float64Array; // [n]
   private readonly corrections: Float64Array; // [n]
-  private readonly shares: Float64Array; // [V]
-  private readonly targets: Float64Array;
-  private readonly thresholds: Float64Array;
-  private readonly slopes: Float64Array;
-  private readonly scale: readonly [number, number, number, number]; // of squares, by group of inputs
-  private readonly meanShare: number;
+  private readonly factors: Float64Array; // [V]
+  private readonly usual: number; // mean factor
 
   constructor(
-    private readonly label: Label,
+    private readonly levels: number, // of the cell
     private readonly views: Views,
-    private readonly sent: LabelPromises,
+    private readonly sent: CellPromises,
+    private readonly scale: readonly [number, number, number, number],
   ) {
     this.own = Int32Array.from(sums(sent.views, 1));
     this.logDistances = sums(sent.logDistances.steps, sent.logDistances.unit);
-    this.corrections = sums(sent.corrections, CORRECTION_STEP);
-    this.shares = sums(sent.shares, STEP);
-    this.targets = Float64Array.from(sent.targets, (target) => target * STEP);
-    this.thresholds = Float64Array.from(sent.thresholds, (threshold) => threshold * STEP);
-    this.slopes = Float64Array.from(sent.slopes, (slope) => slope * STEP);
-    const [position, direction, screen, log] = sent.lengths;
-    this.scale = [position ** -2, direction ** -2, screen ** -2, log ** -2];
-    this.meanShare = this.shares.reduce((sum, s) => sum + s, 0) / Math.max(this.shares.length, 1);
-  }
-
-  /** Whether the label has the levels of its model. */
-  static fits(label: Label, sent: LabelPromises): boolean {
-    return sent.levels.every((level) => level <= label.levels.length);
+    this.corrections = sums(sent.corrections ?? [], CORRECTION_STEP);
+    this.factors = sums(sent.factors ?? [], 1).map((steps) => (steps < 0 ? -1 : steps * FACTOR_STEP));
+    const known = this.factors.filter((factor) => factor >= 0);
+    this.usual = known.length ? known.reduce((sum, factor) => sum + factor, 0) / known.length : 1;
   }
 
   /**
-   * @param distance - to the label, the bundle's units, NaN: unknown
-   * @param viewpoint - in the bundle's frame
+   * Expected quality by level, which never falls; NaN: unknown.
+   *
+   * @param distance - the bundle's units, NaN: unknown
    */
-  predict(distance: number, viewpoint: From): Prediction {
+  mean(distance: number): number[] {
     const { sent, scale, views } = this;
-    views.from(viewpoint);
     this.weights ??= this.solve();
     const n = this.own.length;
     const log = distance > 0 && distance < Infinity ? Math.log(distance) : sent.medianLogDistance;
     const near = new Float64Array(n);
-    let support = 0;
     for (let i = 0; i < n; i++) {
       const view = this.own[i] as number;
       const further = log - (this.logDistances[i] as number);
       const seen = (views.rescaled[view] as number) * scale[2] + further * further * scale[3];
       near[i] = matern(this.square(view) + seen);
-      support = Math.max(support, near[i] as number);
     }
     const { weights } = this;
     const mean = sent.levels.map((_, level) => {
       let moved = 0;
       for (let i = 0, at = level * n; i < n; i++) moved += (near[i] as number) * (weights[at + i] as number);
-      const curve = sent.curves[level];
+      const curve = sent.curves?.[level];
       return (curve ? curveAt(curve, distance) : 0) + (sent.offsets[level] as number) + moved;
     });
-    return this.promise(rising(mean), support);
+    return spread(rising(mean), sent.levels, this.levels);
   }
 
-  /** A distance by boxes, corrected by their errors in the label's views nearby; NaN stays NaN. */
-  corrected(distance: number, viewpoint: From): number {
-    this.views.from(viewpoint);
+  /** A distance by points, corrected by their errors in the label's views nearby; NaN stays NaN. */
+  corrected(distance: number): number {
     let [sum, total] = [0, 0];
-    for (let i = 0; i < this.own.length; i++) {
+    for (let i = 0; i < this.corrections.length; i++) {
       const weight = matern(this.square(this.own[i] as number)) ** NEIGHBOUR_EXPONENT;
       sum += weight * (this.corrections[i] as number);
       total += weight;
@@ -193,17 +222,18 @@ export class ViewModel {
     return distance * Math.exp(sum / (total + HALF_WEIGHT));
   }
 
-  /** The label's pixel share at a viewpoint, from the known views near it, 0..1. */
-  share(viewpoint: From): number {
-    const { shares } = this;
-    this.views.from(viewpoint);
-    let [sum, total] = [0, 0];
-    for (let view = 0; view < shares.length; view++) {
-      const alike = maternTable(this.square(view));
-      sum += alike * (shares[view] as number);
-      total += alike;
+  /** The cell's pixels over those by its points, from the known views near by. */
+  factor(): number {
+    const { factors } = this;
+    const { alike } = this.views;
+    let [sum, total] = [HALF_WEIGHT * this.usual, HALF_WEIGHT];
+    for (let view = 0; view < factors.length; view++) {
+      const factor = factors[view] as number;
+      if (factor < 0) continue;
+      sum += (alike[view] as number) * factor;
+      total += alike[view] as number;
     }
-    return total > 1e-12 ? sum / total : this.meanShare;
+    return sum / total;
   }
 
   /** Square of the scaled difference in place between the current viewpoint and a view. */
@@ -211,43 +241,6 @@ export class ViewModel {
     return (
       (this.views.away[view] as number) * this.scale[0] + (this.views.turned[view] as number) * this.scale[1]
     );
-  }
-
-  private promise(mean: readonly number[], support: number): Prediction {
-    const { sent, label } = this;
-    const unknown = label.levels.map(() => Number.NaN);
-    const known = this.targets.length > 0;
-    const outside = support < sent.leastSupport;
-    const far = this.views.fromPhotos;
-    const needed = this.needed(Number.isNaN(far) ? 1 - support : far);
-    const bound = mean.map((m) => (outside || !known ? Number.NaN : this.bound(m, needed)));
-    return {
-      mean: spread(mean, sent.levels, unknown),
-      bound: spread(bound, sent.levels, unknown),
-      support,
-      trust: outside ? "outside" : known ? sent.status : "unknown",
-    };
-  }
-
-  /** The mean from which on a level keeps each target that far away: never less than for a lower one, at most 1. */
-  private needed(away: number): Float64Array {
-    let least = -Infinity;
-    return this.thresholds.map((threshold, g) => {
-      least = Math.max(least, threshold + (this.slopes[g] as number) * away);
-      return Math.min(least, 1);
-    });
-  }
-
-  /** The largest target that a mean keeps, between targets interpolated. */
-  private bound(mean: number, needed: Float64Array): number {
-    const { targets } = this;
-    const last = targets.length - 1;
-    const above = needed.findIndex((threshold) => threshold > mean);
-    if (above < 0) return targets[last] as number;
-    const [t1, m1] = [targets[above] as number, needed[above] as number];
-    if (above === 0) return mean + (t1 - m1);
-    const [t0, m0] = [targets[above - 1] as number, needed[above - 1] as number];
-    return t0 + ((t1 - t0) / (m1 - m0)) * (mean - m0);
   }
 
   /** The weights by which the process has the values that were sent. */
@@ -266,8 +259,84 @@ export class ViewModel {
   }
 }
 
+/** The viewpoint models of a label's cells, and what the label keeps. */
+export class LabelModel {
+  readonly cells: readonly CellModel[]; // as the label's, or one for all of them
+  private readonly targets: Float64Array;
+  private readonly thresholds: Float64Array;
+  private readonly slopes: Float64Array;
+  private readonly scale: readonly [number, number, number, number];
+
+  constructor(
+    label: Label,
+    private readonly views: Views,
+    private readonly sent: LabelPromises,
+  ) {
+    this.scale = scalesOf(sent);
+    this.cells = ownModels(label, sent).map((own, i) => {
+      const levels = own.id < 0 ? levelsOf(label) : (label.cells[i]?.levels.length ?? 0);
+      return new CellModel(levels, views, own, this.scale);
+    });
+    this.targets = Float64Array.from(sent.targets, (target) => target * STEP);
+    this.thresholds = Float64Array.from(sent.thresholds, (threshold) => threshold * STEP);
+    this.slopes = Float64Array.from(sent.slopes, (slope) => slope * STEP);
+  }
+
+  /** Whether each cell has a model, or all have one, of levels that there are. */
+  static fits(label: Label, sent: LabelPromises): boolean {
+    const models = ownModels(label, sent);
+    const most = (own: CellPromises, i: number) =>
+      own.id < 0 ? levelsOf(label) : (label.cells[i]?.levels.length ?? 0);
+    return (
+      models.length > 0 &&
+      models.every((own, i) => own.levels.every((level) => level <= most(own, i))) &&
+      (models[0]?.id === -1 || models.length === label.cells.length)
+    );
+  }
+
+  /** What the label keeps at the viewpoint that the views are seen from. */
+  outlook(): Outlook {
+    const { sent, targets } = this;
+    const support = this.support();
+    const trust = support < sent.leastSupport ? "outside" : targets.length ? sent.status : "unknown";
+    if (trust === "outside" || trust === "unknown") return { keeps: null, support, trust };
+    const far = this.views.fromPhotos;
+    return { keeps: { targets, needed: this.needed(Number.isNaN(far) ? 1 - support : far) }, support, trust };
+  }
+
+  private support(): number {
+    const { views, scale } = this;
+    let least = Infinity;
+    for (let i = 0; i < views.away.length; i++) {
+      const place = (views.away[i] as number) * scale[0] + (views.turned[i] as number) * scale[1];
+      least = Math.min(least, place + (views.rescaled[i] as number) * scale[2]);
+    }
+    return least < Infinity ? matern(least) : 0;
+  }
+
+  /** The mean from which on each target is kept that far away: never less than for a lower one, at most 1. */
+  private needed(away: number): Float64Array {
+    let least = -Infinity;
+    return this.thresholds.map((threshold, g) => {
+      least = Math.max(least, threshold + (this.slopes[g] as number) * away);
+      return Math.min(least, 1);
+    });
+  }
+}
+
+/** The models of the label's cells, in their order, as far as there are; or that of the label as a whole. */
+function ownModels(label: Label, { cells }: LabelPromises): readonly CellPromises[] {
+  const whole = cells.find(({ id }) => id < 0);
+  if (whole) return [whole];
+  const byId = new Map(cells.map((own) => [own.id, own]));
+  return label.cells.flatMap(({ id }) => byId.get(id) ?? []);
+}
+
+/** Levels of a label: of the cell that has most. */
+export const levelsOf = ({ cells }: Label): number => Math.max(0, ...cells.map((cell) => cell.levels.length));
+
 /** Values [K, n] from their differences along the views and to the level below. */
-function valuesOf({ values }: LabelPromises): Float64Array {
+function valuesOf({ values }: CellPromises): Float64Array {
   const n = values.steps[0]?.length ?? 0;
   const out = new Float64Array(n * values.steps.length);
   const level = new Float64Array(n); // whole numbers, so the sums are exact
@@ -306,13 +375,14 @@ function running(values: readonly number[], pick: (a: number, b: number) => numb
   });
 }
 
-/** Values of given levels (1-based) as an array over all levels. */
-function spread(values: readonly number[], levels: readonly number[], among: readonly number[]): number[] {
-  const out = [...among];
+/** Values of given levels (1-based) as an array over so many levels. */
+function spread(values: readonly number[], levels: readonly number[], count: number): number[] {
+  const out = new Array<number>(count).fill(Number.NaN);
   levels.forEach((level, i) => {
-    out[level - 1] = values[i] ?? Number.NaN;
+    if (level <= count) out[level - 1] = values[i] ?? Number.NaN;
   });
   return out;
 }
 
 const clip = (ssim: number): number => Math.min(Math.max(ssim, -1), 1);
+const at = (values: ArrayLike<number>, i: number): number => values[i] as number;

@@ -11,6 +11,7 @@ export function rangesOf(files: readonly File[]): Map<string, File[]> {
     if (known) known.push(file);
     else ranges.set(file.uri, [file]);
   }
+  for (const files of ranges.values()) files.sort((a, b) => (a.offset ?? 0) - (b.offset ?? 0));
   return ranges;
 }
 

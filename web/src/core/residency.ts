@@ -1,9 +1,8 @@
-/** Tracks which increments of each label are decoded, and which of these are drawn. */
+/** Tracks which increments of each cell are decoded, and which of these are drawn. */
 
-import type { Handle, Label, Level, Renderer } from "../types";
-import type { Sight } from "./distance";
+import type { Cell, Handle, Label, Level, Renderer } from "../types";
+import { Points, type Sight } from "./distance";
 import { type Candidate, type Ladder, ladderOf } from "./planner";
-import type { Prediction } from "./quality";
 
 /** An increment with its value: pixel-weighted SSIM gain per byte, along the concave hull. */
 export interface Step {
@@ -11,33 +10,46 @@ export interface Step {
   readonly value: number;
 }
 
-/** A label of the manifest. Drawn are the increments of level `shown`, or `former` until those are decoded. */
+/** A cell of the manifest. Drawn are the increments of level `shown`, or `former` until those are decoded. */
 export class Entry {
   readonly ladder: Ladder;
   readonly replaces: boolean; // whether any level replaces those below
   readonly decoded: (Handle | undefined)[]; // by increment
   /** Of a stream, the increments that were decoded, as they came: those that are disposed of are decoded again. */
   readonly contents: (Uint8Array | undefined)[] = [];
-  wanted = 0;
+  planned = 0;
+  around = 0; // level once everything in sight is drawn as planned
+  wanted = 0; // one of the two, or on the way between
   shown = 0;
   decoding = 0; // level being decoded, 0: none
   former: Drawn | null = null;
-  sight: Sight = { visible: true, distance: Number.NaN, size: 0 };
+  readonly points: Points;
+  sight: Sight = { visible: true, distance: Number.NaN, apparent: 0, potential: 0 };
   share = 0; // pixel share
+  mean: readonly number[] = []; // by level, expected quality, never falls; NaN: unknown
   candidate: Candidate | null = null; // input of the current plan
   steps: { candidate: Candidate; have: number; first: number; found: Step[] } | null = null; // from the loaded to the planned level
-  prediction: Prediction = { mean: [], bound: [], support: Number.NaN, trust: "unknown" };
 
-  constructor(public label: Label) {
-    this.ladder = ladderOf(label);
-    this.replaces = label.levels.some(({ refine }) => refine);
-    this.decoded = label.levels.map(() => undefined);
+  constructor(
+    public label: Label,
+    public cell: Cell,
+  ) {
+    this.ladder = ladderOf(cell);
+    this.points = new Points(cell);
+    this.replaces = cell.levels.some(({ refine }) => refine);
+    this.decoded = cell.levels.map(() => undefined);
+  }
+
+  /** The increments below one that its decoder needs: of a stream all of the cell, which came in their order. */
+  below(level: number): readonly Uint8Array[] {
+    if (this.cell.levels[level - 1]?.format !== "stream") return [];
+    return this.contents.slice(0, level - 1).flatMap((content) => content ?? []);
   }
 
   /** Number of increments below a level that are not part of it, since it or a level below it replaces them. */
   start(level: number): number {
     if (!this.replaces) return 0;
-    for (let k = level; k > 1; k--) if (this.label.levels[k - 1]?.refine) return k - 1;
+    for (let k = level; k > 1; k--) if (this.cell.levels[k - 1]?.refine) return k - 1;
     return 0;
   }
 
@@ -89,7 +101,7 @@ export class Entry {
   }
 
   files(from: number, to: number): { file: Level; level: number }[] {
-    return this.label.levels.slice(from, to).map((file, i) => ({ file, level: from + i + 1 }));
+    return this.cell.levels.slice(from, to).map((file, i) => ({ file, level: from + i + 1 }));
   }
 
   /** The drawn increments of a level. */
@@ -103,14 +115,13 @@ export class Entry {
 
   /** GPU bytes of all decoded increments, including replaced ones that are still drawn. */
   get gpuBytes(): number {
-    const own = this.label.levels.reduce((sum, file, i) => sum + (this.decoded[i] ? file.gpuBytes : 0), 0);
+    const own = this.cell.levels.reduce((sum, file, i) => sum + (this.decoded[i] ? file.gpuBytes : 0), 0);
     return own + (this.former ? gpuBytesOf(this.former) : 0);
   }
 }
 
 /** Drawn content that will be replaced. */
 export interface Drawn {
-  readonly label: Label;
   readonly handles: readonly Handle[];
   readonly level: number;
   readonly ladder: Ladder;
@@ -118,45 +129,52 @@ export interface Drawn {
 
 export const gpuBytesOf = (drawn: Drawn): number => drawn.ladder.gpuBytes[drawn.level - 1] ?? 0;
 
-/** The drawn increments of a removed label; disposes of its other decoded increments. */
+/** The drawn increments of a removed cell; disposes of its other decoded increments. */
 function retire(entry: Entry, hidden: Hidden, renderer: Renderer): Drawn | null {
-  const { label, ladder, shown } = entry;
+  const { ladder, shown } = entry;
   const handles = entry.drawn(shown);
   for (const handle of entry.handles(0, entry.decoded.length)) {
     if (handles.includes(handle)) continue;
     hidden.remove(handle);
     renderer.dispose(handle);
   }
-  return shown ? { label, handles, level: shown, ladder } : entry.former;
+  return shown ? { handles, level: shown, ladder } : entry.former;
 }
 
-/** Entries for the labels of a new manifest, and the drawn increments of removed labels. */
+/** Entries for the cells of all labels. */
+export const entriesOf = (labels: readonly Label[]): Entry[] =>
+  labels.flatMap((label) => label.cells.map((cell) => new Entry(label, cell)));
+
+/** Entries for the cells of a new manifest, and the drawn increments of removed cells. */
 export function exchange(
   entries: readonly Entry[],
   labels: readonly Label[],
   hidden: Hidden,
   renderer: Renderer,
 ): { entries: Entry[]; leaving: Drawn[] } {
-  const before = new Map(entries.map((entry) => [entry.label.id, entry]));
-  const next = labels.map((label) => {
-    const old = before.get(label.id);
-    before.delete(label.id);
-    return old ? renewed(old, label, hidden, renderer) : new Entry(label);
+  const before = new Map(entries.map((entry) => [entry.cell.id, entry]));
+  const next = entriesOf(labels).map((fresh) => {
+    const old = before.get(fresh.cell.id);
+    // drawn content changes its label at once, or not at all
+    if (old?.label.id !== fresh.label.id) return fresh;
+    before.delete(fresh.cell.id);
+    return renewed(old, fresh, hidden, renderer);
   });
   const leaving = [...before.values()].flatMap((entry) => retire(entry, hidden, renderer) ?? []);
   return { entries: next, leaving };
 }
 
-/** The entry of a label in a new manifest: the old one if its content is the same. */
-function renewed(old: Entry, label: Label, hidden: Hidden, renderer: Renderer): Entry {
-  const files = (of: Label) => of.levels.map((file) => file.sha256 + (file.refine ?? "")).join();
-  if (files(old.label) === files(label)) {
-    old.label = label;
+/** The entry of a cell in a new manifest: the old one if its content is the same. */
+function renewed(old: Entry, fresh: Entry, hidden: Hidden, renderer: Renderer): Entry {
+  const files = ({ cell }: Entry) => cell.levels.map((file) => file.sha256 + (file.refine ?? "")).join();
+  const places = ({ cell }: Entry) => [cell.bounds, cell.points, cell.area, cell.radius].join();
+  if (files(old) === files(fresh) && places(old) === places(fresh)) {
+    old.label = fresh.label;
+    old.cell = fresh.cell;
     return old;
   }
-  const entry = new Entry(label);
-  entry.former = retire(old, hidden, renderer);
-  return entry;
+  fresh.former = retire(old, hidden, renderer);
+  return fresh;
 }
 
 /** Decoded increments that are not drawn, least recently drawn first. */
@@ -168,7 +186,7 @@ export class Hidden {
 
   add(entry: Entry, handle: Handle): void {
     this.remove(handle);
-    const bytes = entry.label.levels[handle.level - 1]?.gpuBytes ?? 0;
+    const bytes = entry.cell.levels[handle.level - 1]?.gpuBytes ?? 0;
     this.kept.set(handle, { entry, bytes });
     this.bytes += bytes;
   }
@@ -203,7 +221,7 @@ export function settle(
   const show: Handle[] = [];
   const hide: Handle[] = [];
   const gone: Handle[] = [];
-  // new content of a live scene is swapped in completely, or neighbouring labels would not match
+  // new content of a live scene is swapped in completely, or neighbouring cells would not match
   const renewed = entries.every((e) => !isChanging(e) || e.isComplete(e.wanted));
   for (const e of entries) {
     if (isChanging(e) ? !renewed : e.former) continue;
@@ -237,5 +255,5 @@ function keepOthers(e: Entry, hidden: Hidden): void {
   }
 }
 
-/** Whether a label waits for new content that is available. */
+/** Whether a cell waits for new content that is available. */
 const isChanging = (e: Entry): boolean => e.former !== null && e.wanted > 0;

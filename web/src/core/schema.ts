@@ -24,7 +24,6 @@ export interface Schema {
   readonly maxItems?: number;
   readonly properties?: Readonly<Record<string, Schema>>;
   readonly required?: readonly string[];
-  readonly dependentRequired?: Readonly<Record<string, readonly string[]>>;
 }
 
 /** What each type is called in messages, and its test. */
@@ -79,7 +78,7 @@ function check(value: unknown, schema: Schema, root: Schema, path: string, wrong
 
 function checkFields(
   value: Readonly<Record<string, unknown>>,
-  { properties = {}, required = [], dependentRequired = {} }: Schema,
+  { properties = {}, required = [] }: Schema,
   root: Schema,
   path: string,
   wrong: string[],
@@ -88,10 +87,6 @@ function checkFields(
   for (const [name, schema] of Object.entries(properties)) {
     if (value[name] !== undefined) check(value[name], schema, root, before + name, wrong);
     else if (required.includes(name)) wrong.push(`${before}${name} is missing`);
-  }
-  for (const [name, others] of Object.entries(dependentRequired)) {
-    if (value[name] === undefined) continue;
-    for (const other of others) if (value[other] === undefined) wrong.push(`${before}${other} is missing`);
   }
 }
 

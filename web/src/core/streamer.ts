@@ -12,7 +12,7 @@ import type {
   Viewpoint,
 } from "../types";
 import { describe } from "./describe";
-import { type Lens, photoFrustum, rotate, widestLens } from "./distance";
+import { rotate } from "./distance";
 import { type Clock, clockOfBrowser, type Digest, digestOfBrowser, type Fetch, type File } from "./download";
 import { Downloads, TRIES_BEFORE_NOTICE } from "./downloads";
 import { normalised, same } from "./inputs";
@@ -22,8 +22,8 @@ import { inOrder } from "./order";
 import { filesOf } from "./pack";
 import { makePlan, type Plan } from "./planner";
 import { screenOf } from "./quality";
-import { type Drawn, Entry, exchange, gpuBytesOf, Hidden, settle } from "./residency";
-import { ViewpointModels } from "./viewpoints";
+import { type Drawn, type Entry, entriesOf, exchange, gpuBytesOf, Hidden, settle } from "./residency";
+import { type Family, familiesOf, ViewpointModels } from "./viewpoints";
 
 export interface StreamerOptions {
   readonly manifest: Manifest;
@@ -45,6 +45,7 @@ const FILE_CACHE_BYTES = 64 * 2 ** 20;
 const MAX_DECODES = 4; // concurrent
 const DELAYING_SHARE = 0.05; // size of the viewpoint models, relative to a pack, from which on they delay it
 const WITHOUT_MODELS = "levels are planned by what holds for all viewpoints.";
+const LENS = [0.8, 0.5] as const; // until there is a viewpoint
 const UNCHECKED = "Served without https: files are checked by their size only.";
 
 export class Streamer {
@@ -58,9 +59,9 @@ export class Streamer {
   private settings: Settings;
   private viewpoint: Viewpoint;
   private content: Manifest;
-  private lens: Lens | null; // of the photos
-  private entries: Entry[];
-  private leaving: Drawn[] = []; // drawn increments of labels that a new manifest removed
+  private families: Family[];
+  private entries: Entry[]; // of all families
+  private leaving: Drawn[] = []; // drawn increments of cells that a new manifest removed
   private modelsByQuality = new Map<Quality, ViewpointModels>(); // those that were asked for
   private planned: Plan["status"] = "ok";
   private nextPlan = -Infinity; // ms of the clock: earliest time
@@ -82,8 +83,8 @@ export class Streamer {
     this.renderer = renderer;
     this.settings = normalised(settings);
     this.content = manifest;
-    this.lens = widestLens(manifest.cameras);
-    this.entries = manifest.labels.map((label) => new Entry(label));
+    this.entries = entriesOf(manifest.labels);
+    this.families = familiesOf(this.entries);
     this.hidden = new Hidden(renderer);
     this.digest = options.digest === undefined ? digestOfBrowser : options.digest;
     this.downloads = new Downloads({
@@ -95,9 +96,9 @@ export class Streamer {
       changed: () => this.arrived(),
       ...(options.downloads && { maxDownloads: options.downloads }),
     });
-    this.downloads.setRanges(manifest.labels.flatMap(({ levels }) => levels));
+    this.downloads.setRanges(this.entries.flatMap(({ cell }) => cell.levels));
     const { position, quaternion } = manifest.start;
-    this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [] };
+    this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [], lens: LENS };
   }
 
   /** The manifest in use; in a live bundle it changes. */
@@ -166,6 +167,7 @@ export class Streamer {
     this.renderer.swap([], [...former, ...this.entries.flatMap((e) => e.drawn(e.shown))]);
     for (const handle of all) this.renderer.dispose(handle);
     this.entries = [];
+    this.families = [];
     this.leaving = [];
     this.known = null;
     this.listeners.clear();
@@ -183,28 +185,42 @@ export class Streamer {
   private plan(): void {
     this.dirty = false;
     const begun = this.clock.now();
-    const photo = photoFrustum(this.viewpoint, this.lens);
-    for (const entry of this.entries) this.models.see(entry, this.viewpoint, photo);
-    const candidates = this.entries.map((entry) => {
-      return this.models.candidate(entry, this.settings, this.highest(entry));
+    const { models } = this;
+    models.see(this.families, this.viewpoint);
+    const groups = this.families.map((family) => {
+      return models.group(family, this.settings, (entry) => this.highest(entry));
     });
-    const { wanted, status } = makePlan(candidates, this.settings);
+    const { wanted, around, status } = makePlan(groups, this.settings);
     this.planned = status;
-    this.entries.forEach((entry, i) => {
-      entry.wanted = wanted[i] ?? 0;
-      entry.candidate = candidates[i] ?? null;
+    this.families.forEach(({ entries }, i) => {
+      entries.forEach((entry, j) => {
+        const cell = models.isByLabel ? 0 : j;
+        const highest = this.highest(entry);
+        entry.planned = Math.min(wanted[i]?.[cell] ?? 0, highest);
+        entry.around = Math.min(around[i]?.[cell] ?? 0, highest);
+      });
     });
-    this.wantedKeys = new Set(this.entries.flatMap((e) => e.path.map((f) => f.file.sha256)));
-    if (this.promises) this.wantedKeys.add(this.promises.sha256);
+    this.aim();
     const took = this.clock.now() - begun;
     this.nextPlan = begun + Math.max(PLAN_EVERY, (1 + PAUSE) * took);
     this.work();
   }
 
-  /** Highest available level of a label: below its first damaged increment. */
+  /** Sets the levels to go for: cells out of sight are raised once everything in sight is drawn as planned. */
+  private aim(): void {
+    const isDrawn = this.entries.every(({ sight, shown, planned }) => !sight.visible || shown >= planned);
+    for (const e of this.entries) {
+      const most = isDrawn ? e.around : Math.min(e.shown, e.around);
+      e.wanted = e.sight.visible ? e.planned : Math.max(e.planned, most);
+    }
+    this.wantedKeys = new Set(this.entries.flatMap((e) => e.path.map((f) => f.file.sha256)));
+    if (this.promises) this.wantedKeys.add(this.promises.sha256);
+  }
+
+  /** Highest available level of a cell: below its first damaged increment. */
   private highest(entry: Entry): number {
-    const broken = entry.label.levels.findIndex((file) => this.downloads.failure(file)?.lasting);
-    return broken < 0 ? entry.label.levels.length : broken;
+    const broken = entry.cell.levels.findIndex((file) => this.downloads.failure(file)?.lasting);
+    return broken < 0 ? entry.cell.levels.length : broken;
   }
 
   /** Draws decoded increments, decodes downloaded ones, downloads missing ones. */
@@ -220,6 +236,7 @@ export class Streamer {
       return;
     }
     this.draw();
+    if (this.entries.some(({ wanted, around }) => wanted < around)) this.aim();
     this.hidden.shrink(this.settings.cacheBytes);
     this.decodeMore();
     const promises = this.missingPromises();
@@ -279,13 +296,13 @@ export class Streamer {
   /** Decodes in the order of arrival, which is that of value. */
   private decodeMore(): void {
     const came = this.downloads.arrivals;
-    const place = (entry: Entry) => came.get(entry.label.levels[entry.next - 1]?.sha256 ?? "") ?? -1;
+    const place = (entry: Entry) => came.get(entry.cell.levels[entry.next - 1]?.sha256 ?? "") ?? -1;
     for (const entry of [...this.entries].sort((a, b) => place(a) - place(b))) this.decodeNext(entry);
   }
 
   private decodeNext(entry: Entry): void {
     const level = entry.next;
-    const file = entry.label.levels[level - 1];
+    const file = entry.cell.levels[level - 1];
     if (!file || entry.decoding || this.decodes >= MAX_DECODES) return;
     if (this.downloads.failure(file)?.lasting) return;
     const content = entry.contents[level - 1] ?? this.downloads.take(file);
@@ -297,9 +314,8 @@ export class Streamer {
     this.decodes += 1;
     let handle: Handle | undefined;
     try {
-      const below =
-        file.format === "stream" ? entry.contents.slice(0, level - 1).flatMap((one) => one ?? []) : [];
-      handle = await this.renderer.decode(entry.label.id, level, content, file.format, below);
+      const { label, cell } = entry;
+      handle = await this.renderer.decode(label.id, cell.id, level, content, file.format, entry.below(level));
       if (file.format === "stream") entry.contents[level - 1] = content;
     } catch {
       this.downloads.markCorrupt(file, `${file.uri} cannot be decoded`);
@@ -363,11 +379,11 @@ export class Streamer {
   private adopt(manifest: Manifest): void {
     const { entries, leaving } = exchange(this.entries, manifest.labels, this.hidden, this.renderer);
     this.entries = entries;
+    this.families = familiesOf(entries);
     this.leaving.push(...leaving);
     this.modelsByQuality.clear();
     this.content = manifest;
-    this.lens = widestLens(manifest.cameras);
-    this.downloads.setRanges(manifest.labels.flatMap(({ levels }) => levels));
+    this.downloads.setRanges(entries.flatMap(({ cell }) => cell.levels));
     this.trouble = null;
     this.downloads.clearFailures();
     this.plan();
@@ -417,7 +433,7 @@ export class Streamer {
 
   private describe(): State {
     const promises = this.promises && this.downloads.failure(this.promises);
-    return describe(this.entries, {
+    return describe(this.families, {
       planned: this.planned,
       bytesLoaded: this.downloads.received,
       bandwidth: this.downloads.bandwidth.rate,
@@ -434,7 +450,7 @@ export class Streamer {
         !this.digest && UNCHECKED,
       ].map((note) => note || null),
       failure: (entry, level) => {
-        const file = entry.label.levels[level - 1];
+        const file = entry.cell.levels[level - 1];
         return file && this.downloads.failure(file);
       },
     });

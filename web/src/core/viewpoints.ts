@@ -1,28 +1,57 @@
-/** Each label from the current viewpoint: distance, quality and pixel share. */
+/** Each cell from the current viewpoint: distance, quality and pixel share; and what its label keeps. */
 
 import type { Label, Promises, Quality, Settings, Viewpoint } from "../types";
-import { look } from "./distance";
-import type { Candidate } from "./planner";
-import { anywhere, type Prediction, ViewModel, Views } from "./quality";
+import { Points } from "./distance";
+import type { Candidate, Group } from "./planner";
+import {
+  boundOf,
+  LabelModel,
+  levelsOf,
+  meansAnywhere,
+  neededFor,
+  type Outlook,
+  outlookAnywhere,
+  Views,
+} from "./quality";
 import type { Entry } from "./residency";
 
-/** Without viewpoint models, quality is the same everywhere and pixel share depends on the size of the boxes. */
+/** The cells of a label. */
+export interface Family {
+  readonly label: Label;
+  readonly entries: readonly Entry[];
+  outlook: Outlook;
+}
+
+const NOTHING: Outlook = { keeps: null, support: Number.NaN, trust: "unknown" };
+
+/** Entries by their labels, in the order of these. */
+export function familiesOf(entries: readonly Entry[]): Family[] {
+  const byLabel = new Map<Label, Entry[]>();
+  for (const entry of entries) {
+    const known = byLabel.get(entry.label);
+    if (known) known.push(entry);
+    else byLabel.set(entry.label, [entry]);
+  }
+  return [...byLabel].map(([label, own]) => ({ label, entries: own, outlook: NOTHING }));
+}
+
+/** Without viewpoint models, quality is the same everywhere and pixel share is the apparent size. */
 export class ViewpointModels {
-  private readonly models = new Map<number, ViewModel>();
-  private readonly wherever = new Map<number, Prediction>(); // without a viewpoint model, or out of sight
+  private readonly models = new Map<number, LabelModel>(); // by label id
+  private readonly views: Views | null;
 
   constructor(
     readonly quality: Quality,
     labels: readonly Label[] = [],
     readonly promises: Promises | null = null,
   ) {
-    for (const label of labels) this.wherever.set(label.id, anywhere(label, quality));
-    if (!promises) return;
-    const views = new Views(promises);
+    this.views = promises && new Views(promises);
     const byId = new Map(labels.map((label) => [label.id, label]));
-    for (const own of promises.labels) {
+    for (const own of promises?.labels ?? []) {
       const label = byId.get(own.id);
-      if (label && ViewModel.fits(label, own)) this.models.set(own.id, new ViewModel(label, views, own));
+      if (label && this.views && LabelModel.fits(label, own)) {
+        this.models.set(own.id, new LabelModel(label, this.views, own));
+      }
     }
   }
 
@@ -31,49 +60,92 @@ export class ViewpointModels {
     return this.promises !== null;
   }
 
-  /** Evaluates a label at the viewpoint; `photo`: its `photoFrustum`. */
-  see(entry: Entry, viewpoint: Viewpoint, photo: Viewpoint["frustum"] = viewpoint.frustum): void {
-    const { label } = entry;
-    const model = this.models.get(label.id);
-    const seen = look(label.boxes, viewpoint, photo);
-    if (!seen.visible && label.boxes.length) {
-      // plans do not depend on labels out of sight; skipping them keeps scenes in blocks fast
-      entry.sight = seen;
-      entry.prediction = this.elsewhere(label);
-      entry.share = seen.size;
-      return;
+  /** Evaluates all cells at the viewpoint. */
+  see(families: readonly Family[], viewpoint: Viewpoint): void {
+    this.views?.from(viewpoint);
+    let total = 0;
+    for (const family of families) {
+      for (const entry of family.entries) entry.sight = entry.points.look(viewpoint);
+      this.predict(family);
+      for (const { share } of family.entries) total += share;
     }
-    const distance = model?.corrected(seen.distance, viewpoint) ?? seen.distance;
-    const sight = { ...seen, distance };
-    // a label without boxes may be anywhere
-    entry.sight = label.boxes.length ? sight : { ...sight, visible: true };
-    entry.prediction = model?.predict(distance, viewpoint) ?? this.elsewhere(label);
-    entry.share = model ? model.share(viewpoint) : this.complete ? 0 : sight.size;
+    const whole = Math.max(1, total);
+    for (const { entries } of families) for (const entry of entries) entry.share /= whole;
   }
 
-  private elsewhere(label: Label): Prediction {
-    return this.wherever.get(label.id) ?? anywhere(label, this.quality);
+  private predict(family: Family): void {
+    const { label, entries } = family;
+    const model = this.models.get(label.id);
+    const isSeen = entries.some(({ sight }) => sight.visible);
+    // plans do not depend on what is out of sight; skipping it keeps large scenes fast
+    const known = label.quality[this.quality];
+    family.outlook = model && isSeen ? model.outlook() : outlookAnywhere(known);
+    const [whole] = model?.cells ?? [];
+    const together = this.isByLabel && isSeen && whole;
+    const means = together
+      ? together.mean(together.corrected(Points.together(entries.map(({ points }) => points))))
+      : meansAnywhere(known, levelsOf(label));
+    for (const [i, entry] of entries.entries()) {
+      const own = this.isByLabel || !entry.sight.visible ? undefined : model?.cells[i];
+      entry.mean = own?.mean(entry.sight.distance) ?? means.slice(0, entry.cell.levels.length);
+      entry.share = entry.sight.apparent * (own?.factor() ?? 1);
+    }
   }
 
-  /** The planner's input for a label. */
-  candidate(
-    entry: Entry,
-    { weights, always }: Pick<Settings, "weights" | "always">,
-    highest: number,
-  ): Candidate {
-    const full = always?.get(entry.label.id);
-    const { label, ladder, prediction, sight, share, wanted } = entry;
+  /** Whether quality is of labels as a whole, whose cells have one level. */
+  get isByLabel(): boolean {
+    return this.quality === "ssim";
+  }
+
+  /** The planner's input for a label, whose entries' candidates are renewed. */
+  group({ label, entries, outlook }: Family, settings: Settings, highest: (entry: Entry) => number): Group {
+    const { keeps } = outlook;
+    const weight = settings.weights.get(label.id) ?? label.weight;
+    const always = settings.always?.get(label.id) ?? label.always;
+    const cells = entries.map((entry) => {
+      const { ladder, mean, share, sight, wanted } = entry;
+      const { potential, visible } = sight;
+      entry.candidate = {
+        ladder,
+        highest: highest(entry),
+        mean,
+        weight,
+        always,
+        share,
+        potential,
+        visible,
+        previous: wanted,
+      };
+      return entry.candidate;
+    });
+    const needed = keeps ? neededFor(keeps, settings.target) : Number.NaN;
+    if (!this.isByLabel) return { cells, needed };
+    const one = asOne(cells);
     return {
-      label,
-      ...(full === undefined ? {} : { always: full }),
-      ladder,
-      highest,
-      mean: prediction.mean,
-      bound: prediction.bound,
-      weight: weights.get(label.id) ?? label.weight,
-      share,
-      visible: sight.visible,
-      previous: wanted,
+      cells: [one],
+      needed,
+      bound: one.mean.map((mean) => (keeps ? boundOf(keeps, mean) : Number.NaN)),
     };
   }
+}
+
+/** The cells of a label as one, all at the same level, or at their last one. */
+function asOne(cells: readonly Candidate[]): Candidate {
+  const [first] = cells as readonly [Candidate];
+  const longest = cells.reduce((a, b) => (b.mean.length > a.mean.length ? b : a), first);
+  const sum = (of: (c: Candidate) => number) => cells.reduce((all, c) => all + of(c), 0);
+  const costs = (unit: keyof Candidate["ladder"]) =>
+    longest.mean.map((_, k) => sum(({ ladder }) => ladder[unit][Math.min(k, ladder[unit].length - 1)] ?? 0));
+  // a damaged increment holds back those cells only that have it
+  const limit = Math.max(...cells.map((c) => c.highest));
+  return {
+    ...first,
+    ladder: { bytes: costs("bytes"), gpuBytes: costs("gpuBytes"), count: costs("count") },
+    highest: limit,
+    mean: longest.mean,
+    share: sum(({ share }) => share),
+    potential: sum(({ potential }) => potential),
+    visible: cells.some(({ visible }) => visible),
+    previous: Math.max(...cells.map(({ previous }) => previous)),
+  };
 }

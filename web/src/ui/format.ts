@@ -41,6 +41,13 @@ export function formatScreens({ least, most, here }: Screens, height: number): s
   return here > most ? known + averaged : known;
 }
 
+/** "37 %"; "100 %" is all of it, "0 %" nothing. */
+export function formatShare(share: number): string {
+  const percent = Math.round(100 * share);
+  if (percent === 0 && share > 0) return "< 1 %";
+  return `${percent === 100 && share < 1 ? 99 : percent} %`;
+}
+
 export function formatSsim(ssim: number): string {
   return Number.isFinite(ssim) ? ssim.toFixed(2) : "–";
 }

@@ -1,20 +1,19 @@
 import { leastPromise } from "../core/describe";
 import { ladderOf } from "../core/planner";
-import type { LabelState, Trust } from "../types";
+import type { Cell, LabelState, Trust } from "../types";
 
-/** The labels of one category: a single label, its instances, or its per-block categories in a scene in blocks. */
+/** The labels of one category: a single label, or its instances. */
 export interface Group {
   readonly key: string;
   readonly title: string;
-  readonly states: readonly LabelState[]; // sorted by block
-  readonly splats: number; // of the last level
+  readonly states: readonly LabelState[];
+  readonly splats: number; // in full
 }
 
 /** The content of a group's row. */
 export interface Summary {
-  readonly shown: number; // share of its levels
+  readonly shown: number; // share of its splats in sight, or else of all
   readonly wanted: number;
-  readonly level: string; // "2/6", or "1–4/6" if the blocks differ
   readonly promised: number; // minimum over visible labels; NaN if one of them has none
   readonly missing: boolean; // whether a visible label is not drawn
   readonly expected: number;
@@ -27,20 +26,19 @@ export interface Summary {
   readonly error: string | null;
 }
 
-/** The labels grouped by category, with all of its instances and blocks, largest first. */
+/** The labels grouped by category, with all of its instances, largest first. */
 export function grouped(states: readonly LabelState[]): Group[] {
   const parents = new Set(states.map(({ label }) => label.parent));
   return groupedBy(states, ({ label }) => {
-    const name = label.category ?? label.name;
     // what has no instance of its own beside those that have: "chair" beside "chair 1"
-    if (label.parent !== undefined || parents.has(name)) return label.parent ?? name;
-    return label.block === undefined ? `#${label.id}` : name;
+    const isFamily = label.parent !== undefined || parents.has(label.name);
+    return isFamily ? (label.parent ?? label.name) : `#${label.id}`;
   });
 }
 
 /** The labels of a category grouped by instance, largest first. */
 export function instances(states: readonly LabelState[]): Group[] {
-  return groupedBy(states, ({ label }) => label.category ?? label.name);
+  return groupedBy(states, ({ label }) => label.name);
 }
 
 function groupedBy(states: readonly LabelState[], keyOf: (state: LabelState) => string): Group[] {
@@ -54,32 +52,32 @@ function groupedBy(states: readonly LabelState[], keyOf: (state: LabelState) => 
   const groups = [...byCategory].map(([key, parts]) => ({
     key,
     title: parts.some(({ label }) => label.parent === key) ? key : (parts[0]?.label.title ?? key),
-    states: parts.sort((a, b) => (a.label.block ?? 0) - (b.label.block ?? 0)),
-    splats: parts.reduce((sum, { label }) => sum + (ladderOf(label).count.at(-1) ?? 0), 0),
+    states: parts,
+    splats: parts.flatMap(({ label }) => label.cells).reduce((sum, cell) => sum + splatsOf(cell), 0),
   }));
   return groups.sort((a, b) => b.splats - a.splats);
 }
+
+const splatsOf = (cell: Cell): number => ladderOf(cell).count.at(-1) ?? 0;
 
 const TRUST: readonly Trust[] = ["outside", "unknown", "uncalibrated", "calibrated"]; // least first
 
 export function summary(states: readonly LabelState[]): Summary {
   const sum = (of: (state: LabelState) => number) => states.reduce((total, state) => total + of(state), 0);
-  const levels = sum(({ label }) => label.levels.length);
   const visible = states.filter((state) => state.visible);
   const counted = visible.length ? visible : states;
   const least = (of: (state: LabelState) => number) => {
     const known = counted.map(of).filter((value) => !Number.isNaN(value));
     return known.length ? Math.min(...known) : Number.NaN;
   };
-  const shown = counted.map((state) => state.shown);
-  const [low, high] = [Math.min(...shown), Math.max(...shown)];
-  const last = Math.max(...states.map(({ label }) => label.levels.length));
+  const whole = counted.reduce((total, { splats }) => total + splats, 0);
+  const part = (of: (state: LabelState) => number) =>
+    counted.reduce((total, state) => total + of(state) * (state.splats / whole), 0);
   return {
-    shown: sum((state) => state.shown) / levels,
-    wanted: sum((state) => state.wanted) / levels,
-    level: `${low === high ? low : `${low}–${high}`}/${last}`,
+    shown: part((state) => state.shown),
+    wanted: part((state) => state.wanted),
     promised: leastPromise(counted),
-    missing: visible.some((state) => !state.shown),
+    missing: visible.some(({ cells }) => cells.some((cell) => cell.visible && !cell.shown)),
     expected: least((state) => state.expected),
     trust: TRUST.find((trust) => counted.some((s) => s.trust === trust)) ?? "unknown",
     count: sum((state) => state.count),
@@ -90,16 +88,3 @@ export function summary(states: readonly LabelState[]): Summary {
     error: states.find((state) => state.error)?.error ?? null,
   };
 }
-
-/** A colour for a block, with hues spread by the golden angle. */
-export const blockColor = (block: number): string => {
-  const hue = (block * 137.508) % 360;
-  const channel = (at: number) => {
-    const k = (at + hue / 30) % 12;
-    const value = 0.55 - 0.3 * Math.max(-1, Math.min(k - 3, 9 - k, 1));
-    return Math.round(255 * value)
-      .toString(16)
-      .padStart(2, "0");
-  };
-  return `#${channel(0)}${channel(8)}${channel(4)}`;
-};

@@ -9,7 +9,7 @@ const HELP: readonly (readonly [string, string])[] = [
   ["O", "orbit or walk"],
   ["[ and ]", "previous photo, next photo"],
   ["C", "compare with the full scene"],
-  ["T", "colour by category, or by block in a scene in blocks"],
+  ["T", "colour by category, then by cell: the parts that have levels of their own"],
   ["L", "edit labels: click, or aim with the cross and press Enter; again for more or less of it"],
   ["H, F, + and -", "while editing: hide, always in full, more or less alike; Ctrl Z undoes"],
   ["P", "open or close the panel"],

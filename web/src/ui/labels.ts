@@ -1,8 +1,8 @@
 import type { LabelState, Trust } from "../types";
 import type { Viewer } from "../view/viewer";
 import { h, iconButton, setIcon, setText } from "./dom";
-import { formatBytes, formatCount, formatDistance, formatSsim, nameOf } from "./format";
-import { blockColor, grouped, instances, summary } from "./groups";
+import { formatBytes, formatCount, formatDistance, formatShare, formatSsim, nameOf } from "./format";
+import { grouped, instances, summary } from "./groups";
 
 const WEIGHTS = [0.25, 0.5, 1, 2, 4];
 const MEANING: Readonly<Record<Trust, string>> = {
@@ -23,7 +23,7 @@ interface Row {
   update(states: readonly LabelState[]): void;
 }
 
-/** The list of categories: colour, level, promised quality, size, distance, weight, and visibility. */
+/** The list of categories: colour, share of its splats, promised quality, size, distance, weight, and visibility. */
 export class LabelTable {
   readonly element = h("ul", { class: "labels", "aria-label": "Labels" });
   readonly #rows = new Map<string, Row>();
@@ -48,7 +48,7 @@ export class LabelTable {
   }
 }
 
-/** The row of a category, which can be expanded to its instances; in a scene in blocks to one row per block. */
+/** The row of a category, which can be expanded to its instances. */
 function labelRow(viewer: Viewer, states: readonly LabelState[], title: string): Row {
   const label = states[0]?.label;
   const isFamily = instances(states).length > 1;
@@ -56,13 +56,9 @@ function labelRow(viewer: Viewer, states: readonly LabelState[], title: string):
   const ids = () => latest.map((state) => state.label.id);
   const isHidden = () => ids().every((id) => viewer.isHidden(id));
   const eye = iconButton("eye", "", () => viewer.setHidden(ids(), !isHidden()));
-  const facts = factsRow(viewer, title, label?.category ?? label?.name ?? "", label?.color ?? "");
+  const facts = factsRow(viewer, title, label?.name ?? "", label?.color ?? "");
   facts.element.append(eye, weightSelect(viewer, ids, title));
-  const parts = isFamily
-    ? partList(facts.element, `${title} by instance`, "instance", instanceRows(viewer))
-    : label?.block === undefined
-      ? null
-      : partList(facts.element, `${title} by block`, "block", blockRows(viewer));
+  const parts = isFamily ? instanceList(viewer, facts.element, title) : null;
   return {
     element: facts.element,
     update: (now) => {
@@ -74,33 +70,11 @@ function labelRow(viewer: Viewer, states: readonly LabelState[], title: string):
   };
 }
 
-/** The parts of a category, each with a key of its own, what it has, and how its row is made. */
-type Parts = (
-  states: readonly LabelState[],
-) => { key: string; states: readonly LabelState[]; make: () => Row }[];
-
-const instanceRows =
-  (viewer: Viewer): Parts =>
-  (states) =>
-    instances(states).map((group) => ({
-      ...group,
-      make: () => labelRow(viewer, group.states, group.title),
-    }));
-
-const blockRows =
-  (viewer: Viewer): Parts =>
-  (states) =>
-    states.map((state) => {
-      const { id, block = 0, name } = state.label;
-      const make = () => factsRow(viewer, `block ${block}`, name, blockColor(block));
-      return { key: String(id), states: [state], make };
-    });
-
-/** The expandable list of a category's instances or blocks. */
-function partList(parent: HTMLElement, title: string, what: string, partsOf: Parts): Pick<Row, "update"> {
+/** The expandable list of a category's instances. */
+function instanceList(viewer: Viewer, parent: HTMLElement, title: string): Pick<Row, "update"> {
   const rows = new Map<string, Row>();
-  const list = h("ul", { class: "parts", "aria-label": title, hidden: true });
-  const more = h("button", { type: "button", class: "blocks", "aria-expanded": "false" });
+  const list = h("ul", { class: "parts", "aria-label": `${title} by instance`, hidden: true });
+  const more = h("button", { type: "button", class: "instances", "aria-expanded": "false" });
   let latest: readonly LabelState[] = [];
   more.addEventListener("click", () => {
     list.hidden = !list.hidden;
@@ -112,27 +86,27 @@ function partList(parent: HTMLElement, title: string, what: string, partsOf: Par
 
   function update(states: readonly LabelState[]): void {
     latest = states;
-    const parts = partsOf(states);
-    setText(more, parts.length === 1 ? `1 ${what}` : `${parts.length} ${what}s`);
+    const parts = instances(states);
+    setText(more, parts.length === 1 ? "1 instance" : `${parts.length} instances`);
     if (list.hidden) return;
-    for (const { key, states: own, make } of parts) {
+    for (const { key, title: own, states: labels } of parts) {
       let row = rows.get(key);
       if (!row) {
-        row = make();
+        row = labelRow(viewer, labels, own);
         rows.set(key, row);
         list.append(row.element);
       }
-      row.update(own);
+      row.update(labels);
     }
   }
   return { update };
 }
 
-/** Colour, name, level, quality, size and distance. */
+/** Colour, name, share of the splats, quality, size and distance. */
 function factsRow(viewer: Viewer, title: string, name: string, color: string): Row {
   const metres = viewer.manifest.frame.metersPerUnit;
   const bar = h("div", { class: "level", role: "img" }, h("i"), h("b"));
-  const level = h("span", { class: "number" });
+  const share = h("span", { class: "number" });
   const quality = h("span", { class: "number ssim" });
   const facts = h("span", { class: "more" });
   const element = h(
@@ -142,7 +116,7 @@ function factsRow(viewer: Viewer, title: string, name: string, color: string): R
     h("span", { class: "name", title: name }, title),
     quality,
     bar,
-    level,
+    share,
     facts,
   );
   element.style.setProperty("--label", color);
@@ -154,9 +128,10 @@ function factsRow(viewer: Viewer, title: string, name: string, color: string): R
     bar.style.setProperty("--wanted", String(now.wanted));
     bar.setAttribute(
       "aria-label",
-      `level ${now.level}, ${Math.round(100 * now.wanted)} % of the levels planned`,
+      `${formatShare(now.shown)} of its splats, ${formatShare(now.wanted)} planned`,
     );
-    setText(level, now.level);
+    setText(share, formatShare(now.shown));
+    share.title = `Drawn of its splats ${now.visible ? "in sight" : "in the whole scene"}`;
     const name = nameOf(viewer.settings.quality);
     setText(quality, formatSsim(now.promised));
     const meaning = now.missing ? "no promise: not all of it is drawn" : MEANING[now.trust];

@@ -44,8 +44,9 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
 
   function update(): void {
     const { state } = viewer;
-    const wanted = state.labels.reduce((sum, label) => sum + label.wanted, 0);
-    const shown = state.labels.reduce((sum, label) => sum + Math.min(label.shown, label.wanted), 0);
+    const cells = state.labels.flatMap((label) => label.cells);
+    const wanted = cells.reduce((sum, cell) => sum + cell.wanted, 0);
+    const shown = cells.reduce((sum, cell) => sum + Math.min(cell.shown, cell.wanted), 0);
     const done = wanted > 0 && shown >= wanted && !state.pending;
     bar.classList.toggle("done", done);
     bar.style.setProperty("--value", String(wanted ? shown / wanted : 0));
@@ -87,9 +88,7 @@ function outside(state: State): string {
 
 /** Names the categories that miss the target, or says that the budget is the limit. */
 function shortfall(state: State, { mode, quality, target }: Settings): string {
-  const short = state.labels.filter(
-    (l) => l.visible && l.wanted === l.label.levels.length && l.promised < target,
-  );
+  const short = state.labels.filter((l) => l.visible && l.wanted === 1 && l.promised < target);
   if (mode !== "target" || !short.length) return "Best quality within the budget";
   return `${named(short)} cannot reach ${nameOf(quality)} ${target.toFixed(2)}`;
 }

@@ -3,7 +3,6 @@ import type { Viewer } from "../view/viewer";
 import { offered, type XrMode } from "../view/xr";
 import { h, iconButton, setIcon, textButton } from "./dom";
 import type { EditorCard } from "./editor";
-import { blockColor } from "./groups";
 import { messageOf } from "./notice";
 import type { Split } from "./split";
 import { nextTheme } from "./theme";
@@ -19,8 +18,8 @@ interface Parts {
 
 /** The toolbar: camera, photos, comparison, colours, help and headset, with keyboard shortcuts. */
 export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; update(): void } {
-  const blocks = viewer.manifest.labels.some(({ block }) => block !== undefined);
-  const tints = blocks ? 3 : 2; // none, by label, by block
+  const parted = viewer.manifest.labels.some(({ cells }) => cells.length > 1);
+  const tints = parted ? 3 : 2; // none, by label, by cell
   let tinted = 0;
   const mode = iconButton("orbit", "Orbit or walk (O)", () => {
     viewer.controls.mode = viewer.controls.mode === "orbit" ? "walk" : "orbit";
@@ -32,8 +31,8 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
   const compare = iconButton("compare", "Compare with the full scene (C)", () => parts.split.toggle());
   const tint = iconButton("tint", "Colour by category (T)", () => {
     tinted = (tinted + 1) % tints;
-    viewer.setTint(tinted ? TINT : 0, tinted === 2 ? blockColors(viewer) : undefined);
-    if (blocks) parts.say(["Original colours", "Coloured by category", "Coloured by block"][tinted] ?? "");
+    viewer.setTint(tinted ? TINT : 0, tinted === 2);
+    if (parted) parts.say(["Original colours", "Coloured by category", "Coloured by cell"][tinted] ?? "");
   });
   const help = iconButton("help", "Help (?)", () => parts.help.showModal());
   const theme = iconButton("theme", "Light or dark", () => parts.say(`Theme: ${nextTheme()}`));
@@ -66,9 +65,6 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
     },
   };
 }
-
-const blockColors = ({ manifest }: Viewer) =>
-  new Map(manifest.labels.map(({ id, block = 0 }) => [id, blockColor(block)]));
 
 function photoPicker(viewer: Viewer): { elements: HTMLElement[]; step(by: number): void; update(): void } {
   const { cameras } = viewer.manifest;

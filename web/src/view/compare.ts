@@ -31,7 +31,7 @@ export class Compare {
     const layer = this.stage.newLayer();
     this.#layer = layer;
     const budget = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
-    const settings: Settings = { ...this.settings(), mode: "full", budget, cacheBytes: 0 };
+    const settings: Settings = { ...this.settings(), mode: "full", budget, cacheBytes: 0, aroundBytes: 0 };
     const { manifest, source } = this;
     this.#streamer = new Streamer({ manifest, ...source, renderer: layer, settings });
     this.#streamer.onChange(onChange);

@@ -4,7 +4,7 @@ import { type Category, Edits, type Operation, type Origin, type Ranks, runsOf }
 import { grow } from "../core/grow";
 import { type Packed, type Picked, pick } from "../core/pick";
 import type { Streamer } from "../core/streamer";
-import type { Label, Manifest, Settings } from "../types";
+import type { Cell, Label, Manifest, Settings } from "../types";
 import { Mark } from "./spark";
 import type { Stage } from "./stage";
 
@@ -151,9 +151,7 @@ export class Editor {
   /** Why categories of this scene cannot be renamed, merged or split; null: they can. */
   get fixed(): string | null {
     const labels = [...this.labels.values()];
-    if (labels.some(({ block }) => block !== undefined)) return "Not in a scene in blocks.";
-    const replaces = labels.some(({ levels }) => levels.some(({ refine }) => refine));
-    return replaces ? "Not where levels replace those below." : null;
+    return labels.some(replaces) ? "Not where levels replace those below." : null;
   }
 
   /** Applies operations, and selects what they leave; throws where one cannot be. */
@@ -200,8 +198,14 @@ export class Editor {
   private meet(x: number, y: number): Picked | null {
     const { layer } = this.viewer.stage;
     const ray = this.viewer.stage.ray(x, y);
-    const clouds = [...this.labels.keys()].flatMap((id) => layer.splatsOf(id) ?? []);
-    return pick(clouds, layer.encodingOf(clouds[0]?.label ?? 0), ray);
+    const clouds = [...this.labels.values()].flatMap((label) =>
+      placed(label).flatMap(({ cell, first }) => {
+        const cloud = layer.splatsOf(cell.id);
+        return cloud ? { ...cloud, first } : [];
+      }),
+    );
+    const some = this.labels.get(clouds[0]?.label ?? 0)?.cells[0];
+    return pick(clouds, layer.encodingOf(some?.id ?? 0), ray);
   }
 
   private categoryAt({ label, rank }: Picked): number {
@@ -210,7 +214,8 @@ export class Editor {
 
   private scopes(found: Picked): Scope[] {
     const hasParent = this.family(this.categoryAt(found)).length > 1;
-    const alike: Scope[] = this.labels.get(found.label)?.levels.some(({ refine }) => refine) ? [] : ["alike"];
+    const label = this.labels.get(found.label);
+    const alike: Scope[] = label && replaces(label) ? [] : ["alike"];
     return [...(hasParent ? (["instance"] as const) : []), "category", ...alike];
   }
 
@@ -244,13 +249,21 @@ export class Editor {
   private region(seed: Seed, category: number): Uint8Array | null {
     const { layer } = this.viewer.stage;
     const owner = this.edits.categories.owner.get(seed.label);
-    const cloud: Packed | null = layer.splatsOf(seed.label);
-    if (!cloud || !owner || cloud.count < owner.length) return null;
+    const cells = this.labels.get(seed.label)?.cells ?? [];
+    const count = cells.reduce((sum, cell) => sum + (layer.splatsOf(cell.id)?.count ?? 0), 0);
+    if (!owner || count < owner.length) return null;
     const among = Uint8Array.from(owner, (number) => +(number === category));
     const tolerance = TOLERANCES[this.width] ?? 0.3;
     // the lit colours of an earlier selection would not be alike
-    const plain = layer.plainWords(seed.label) ?? cloud.words;
-    return grow({ ...cloud, words: plain }, layer.encodingOf(seed.label), seed.rank, tolerance, among);
+    const words = new Uint32Array(4 * count);
+    let end = 0;
+    for (const { id } of cells) {
+      const own = (layer.plainWords(id) ?? new Uint32Array()).subarray(0, words.length - end);
+      words.set(own, end);
+      end += own.length;
+    }
+    const cloud: Packed = { label: seed.label, words, count };
+    return grow(cloud, layer.encodingOf(cells[0]?.id ?? 0), seed.rank, tolerance, among);
   }
 
   private masksOf(isIn: (owner: number) => boolean): Map<number, Uint8Array> {
@@ -285,7 +298,10 @@ export class Editor {
       const waits = this.isWaiting && this.seed?.label === id;
       const full = waits || own.some((one) => one.always);
       if (full !== label.always) always.set(id, full);
-      viewer.stage.layer.setMarks(id, this.marksOf(id, numbers));
+      const marks = this.marksOf(id, numbers);
+      for (const { cell, first } of placed(label)) {
+        viewer.stage.layer.setMarks(cell.id, marks?.slice(first, first + countOf(cell)) ?? null);
+      }
     }
     viewer.set({ weights, always });
     this.notify();
@@ -320,15 +336,26 @@ export class Editor {
 const originOf = (label: Label): Origin => ({
   id: label.id,
   name: label.name,
-  title: label.block === undefined ? label.title : `${label.title}, block ${label.block}`,
-  ...parentOf(label),
-  count: label.levels.reduce((sum, { count }) => sum + count, 0),
+  title: label.title,
+  ...(label.parent !== undefined && { parent: label.parent }),
+  count: label.cells.reduce((sum, cell) => sum + countOf(cell), 0),
   weight: label.weight,
   always: label.always,
   hidden: label.hidden ?? false,
 });
 
-const parentOf = ({ parent, category }: Label): { parent?: string } => {
-  const above = parent ?? category;
-  return above === undefined ? {} : { parent: above };
-};
+/** Splats of a cell's increments. */
+const countOf = ({ levels }: Cell): number => levels.reduce((sum, { count }) => sum + count, 0);
+
+const replaces = ({ cells }: Label): boolean =>
+  cells.some(({ levels }) => levels.some(({ refine }) => refine));
+
+/** The cells of a label, each with the rank of its first splat: a label's ranks go through its cells in turn. */
+function placed({ cells }: Label): { cell: Cell; first: number }[] {
+  let end = 0;
+  return cells.map((cell) => {
+    const first = end;
+    end += countOf(cell);
+    return { cell, first };
+  });
+}

@@ -49,6 +49,7 @@ export function viewpoint(root: Matrix4, camera: Matrix4, projection: Matrix4, f
     position: vec3(new Vector3().setFromMatrixPosition(toBundle)),
     direction: vec3(direction),
     frustum: planes,
+    lens: [1 / Math.abs(projection.elements[0] || 1), 1 / Math.abs(projection.elements[5] || 1)],
     focal,
   };
 }

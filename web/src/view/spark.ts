@@ -1,7 +1,9 @@
 import { dyno, type PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import { Group, type Matrix4, Scene, Vector3, type WebGLRenderer } from "three";
 import type { Encoding, Packed } from "../core/pick";
-import type { Format, Handle, Manifest, Renderer } from "../types";
+import type { Box, Format, Handle, Manifest, Renderer, Viewpoint } from "../types";
+import { colorsOf } from "./colors";
+import { boundsOf, drawnCells, joinedBounds, touches } from "./culling";
 import { type Answer, Decoders } from "./decoding";
 import StreamWorker from "./decoding.worker?worker&inline";
 import { rootMatrix } from "./frame";
@@ -14,18 +16,23 @@ type Color = InstanceType<typeof dyno.DynoVec3<Vector3>>;
 /** A decoded increment. */
 interface Increment extends Handle {
   readonly part: Part;
+  readonly bounds: Box | null;
 }
 
 /**
- * A label's increments as one mesh: first the shown ones, by level, then those hidden since. There is one mesh
- * per label, since Spark pads every mesh to 2048 splats and draws each with its own call.
+ * A cell's increments as one mesh: first the shown ones, by level, then those hidden since. There is one mesh
+ * per cell, since Spark pads every mesh to 2048 splats and draws each with its own call.
  */
 interface Column {
+  readonly label: number;
   readonly mesh: SplatMesh;
   readonly source: Source;
   readonly color: Color;
   shown: readonly Increment[];
   stored: readonly Increment[];
+  bounds: Box | null; // of what is shown
+  drawn: boolean; // in sight, or nearly
+  late: boolean; // drawn again, but not in a picture yet
   weight: number; // of the second opacities in what is stored
   marks: Uint8Array | null; // by splat, one of `Mark`
 }
@@ -49,14 +56,15 @@ class Source {
   forEachSplat: PackedSplats["forEachSplat"] = (callback) => this.splats.forEachSplat(callback);
 }
 
-/** Draws all labels of a scene with Spark; increments can be added and removed without visible gaps. */
+/** Draws all cells of a scene with Spark; increments can be added and removed without visible gaps. */
 export class SparkLayer implements Renderer {
   readonly scene = new Scene();
   readonly root = new Group();
   readonly spark: SparkRenderer;
-  readonly #columns = new Map<number, Column>();
+  readonly #columns = new Map<number, Column>(); // by cell
   readonly #colors = new Map<number, string>();
-  readonly #weights: ReadonlyMap<number, readonly (number | undefined)[]>; // of second opacities, by label and level
+  readonly #hidden = new Set<number>(); // labels
+  readonly #weights: ReadonlyMap<number, readonly (number | undefined)[]>; // of second opacities, by cell and level
   readonly #decoders = new Decoders(startWorker);
   readonly #tint = new dyno.DynoFloat({ value: 0 });
   readonly #dirty: () => void;
@@ -76,12 +84,13 @@ export class SparkLayer implements Renderer {
       preBlurAmount: manifest.antialiased ? 0 : 0.3,
       blurAmount: manifest.antialiased ? 0.3 : 0,
     });
-    this.#weights = new Map(manifest.labels.map(({ id, levels }) => [id, levels.map((one) => one.weight)]));
+    const cells = manifest.labels.flatMap((label) => label.cells.map((cell) => ({ label: label.id, cell })));
+    this.#weights = new Map(cells.map(({ cell }) => [cell.id, cell.levels.map((one) => one.weight)]));
     this.place(rootMatrix(manifest.frame));
     this.scene.add(this.spark, this.root);
     this.setColors(colorsOf(manifest));
     // in advance, in a fixed order: splats of equal depth are drawn in the order of their meshes
-    for (const { id } of manifest.labels) this.#column(id);
+    for (const { label, cell } of cells) this.#column(label, cell.id);
   }
 
   /** Whether the last frame was complete, and sorted for the camera's position. */
@@ -95,7 +104,7 @@ export class SparkLayer implements Renderer {
     matrix.decompose(this.root.position, this.root.quaternion, this.root.scale);
   }
 
-  /** Colours (#rrggbb) by label. */
+  /** Colours (#rrggbb) by cell. */
   setColors(colors: ReadonlyMap<number, string>): void {
     for (const [id, color] of colors) {
       this.#colors.set(id, color);
@@ -106,6 +115,7 @@ export class SparkLayer implements Renderer {
 
   async decode(
     label: number,
+    cell: number,
     level: number,
     bytes: Uint8Array,
     format: Format,
@@ -113,43 +123,73 @@ export class SparkLayer implements Renderer {
   ): Promise<Increment> {
     const part =
       format === "stream"
-        ? await this.#decoders.decode(label, [...below, bytes])
+        ? await this.#decoders.decode(cell, [...below, bytes])
         : await decodePart(bytes, format);
-    return { label, level, count: part.count, part };
+    const bounds = boundsOf(part.splats, part.count, part.encoding);
+    return { label, cell, level, count: part.count, part, bounds };
   }
 
   swap(show: readonly Handle[], hide: readonly Handle[]): void {
-    const labels = new Set([...show, ...hide].map((handle) => handle.label));
-    for (const label of labels) {
-      const column = this.#column(label);
+    const cells = new Map([...show, ...hide].map(({ label, cell }) => [cell, label]));
+    for (const [cell, label] of cells) {
+      const column = this.#column(label, cell);
       const kept = column.shown.filter((part) => !hide.includes(part) && !show.includes(part));
-      const added = show.filter((handle): handle is Increment => handle.label === label);
+      const added = show.filter((handle): handle is Increment => handle.cell === cell);
       column.shown = [...kept, ...added].sort((a, b) => a.level - b.level);
+      column.bounds = column.shown.reduce<Box | null>((all, { bounds }) => joinedBounds(all, bounds), null);
       this.#arrange(column);
     }
     this.#dirty();
   }
 
   dispose(handle: Handle): void {
-    const column = this.#columns.get(handle.label);
+    const column = this.#columns.get(handle.cell);
     if (!column) return;
     column.shown = column.shown.filter((part) => part !== handle);
     if (column.stored.some((part) => part === handle)) this.#store(column);
     this.#dirty();
   }
 
+  /** Leaves out the cells that are far from what a viewpoint sees; to be called before each frame. */
+  cull(view: Viewpoint): void {
+    const columns = [...this.#columns.values()];
+    const drawn = drawnCells(
+      columns.map(({ bounds, source, drawn }) => ({ bounds, count: source.count, drawn })),
+      view,
+    );
+    columns.forEach((column, i) => {
+      const isDrawn = drawn[i] ?? true;
+      if (column.drawn !== isDrawn) column.late = isDrawn;
+      column.drawn = isDrawn;
+      this.#look(column);
+    });
+  }
+
+  /** Whether a cell that was left out is in this view, and the picture with it is not sorted yet. */
+  misses(view: Viewpoint): boolean {
+    const late = [...this.#columns.values()].filter((column) => column.late);
+    if (!late.length) return false;
+    const here = new Set<unknown>(this.spark.display.mapping.map(({ node }) => node));
+    for (const column of late) column.late = !here.has(column.mesh);
+    return late.some(({ late, mesh, bounds }) => {
+      return late && mesh.visible && bounds && touches(bounds, view.frustum);
+    });
+  }
+
   /** Shows or hides a label without releasing its content. */
   setVisible(label: number, visible: boolean): void {
-    this.#column(label).mesh.visible = visible;
+    if (visible) this.#hidden.delete(label);
+    else this.#hidden.add(label);
+    for (const column of this.#columns.values()) this.#look(column);
     this.#dirty();
   }
 
-  /** The shown splats of a label, in the order of its levels. */
-  splatsOf(label: number): Packed | null {
-    const column = this.#columns.get(label);
+  /** The shown splats of a cell, in the order of its levels. */
+  splatsOf(cell: number): Packed | null {
+    const column = this.#columns.get(cell);
     const words = column?.source.splats.packedArray;
-    if (!column || !words || !column.mesh.visible) return null;
-    const { marks, source } = column;
+    if (!column || !words || this.#hidden.has(column.label)) return null;
+    const { marks, source, label } = column;
     return {
       label,
       words,
@@ -158,9 +198,9 @@ export class SparkLayer implements Renderer {
     };
   }
 
-  /** The words of the splats of a label in their own colours. */
-  plainWords(label: number): Uint32Array | null {
-    const column = this.#columns.get(label);
+  /** The words of the splats of a cell in their own colours. */
+  plainWords(cell: number): Uint32Array | null {
+    const column = this.#columns.get(cell);
     if (!column?.stored.length) return null;
     const words = new Uint32Array(4 * total(column.stored));
     let start = 0;
@@ -172,14 +212,14 @@ export class SparkLayer implements Renderer {
   }
 
   /** The encoding of the words of `splatsOf`. */
-  encodingOf(label: number): Encoding {
-    return this.#columns.get(label)?.stored[0]?.part.encoding ?? ENCODING;
+  encodingOf(cell: number): Encoding {
+    return this.#columns.get(cell)?.stored[0]?.part.encoding ?? ENCODING;
   }
 
-  /** Lights or hides splats of a label, by rank; null: all are as they come. */
-  setMarks(label: number, marks: Uint8Array | null): void {
-    const column = this.#column(label);
-    if (column.marks === marks) return;
+  /** Lights or hides splats of a cell, by rank; null: all are as they come. */
+  setMarks(cell: number, marks: Uint8Array | null): void {
+    const column = this.#columns.get(cell);
+    if (!column || column.marks === marks) return;
     column.marks = marks;
     this.#store(column);
     this.#dirty();
@@ -203,17 +243,33 @@ export class SparkLayer implements Renderer {
     this.spark.dispose();
   }
 
-  #column(label: number): Column {
-    const known = this.#columns.get(label);
+  #column(label: number, cell: number): Column {
+    const known = this.#columns.get(cell);
     if (known) return known;
-    const color = new dyno.DynoVec3({ value: rgbOf(this.#colors.get(label) ?? "#8a8f98") });
+    const color = new dyno.DynoVec3({ value: rgbOf(this.#colors.get(cell) ?? "#8a8f98") });
     const source = new Source(joined([]));
     const mesh = new SplatMesh({ splats: source, worldModifier: tinted(color, this.#tint) });
     mesh.raycastable = false;
     this.root.add(mesh);
-    const column = { mesh, source, color, shown: [], stored: [], weight: 0, marks: null };
-    this.#columns.set(label, column);
+    const column = {
+      label,
+      mesh,
+      source,
+      color,
+      shown: [],
+      stored: [],
+      bounds: null,
+      drawn: true,
+      late: false,
+      weight: 0,
+      marks: null,
+    };
+    this.#columns.set(cell, column);
     return column;
+  }
+
+  #look({ mesh, drawn, label }: Column): void {
+    mesh.visible = drawn && !this.#hidden.has(label);
   }
 
   #arrange(column: Column): void {
@@ -251,7 +307,7 @@ export class SparkLayer implements Renderer {
   /** Weight of the second opacities at the level that is shown. */
   #weight({ shown }: Column): number {
     const newest = shown.at(-1);
-    return (newest && this.#weights.get(newest.label)?.[newest.level - 1]) ?? 0;
+    return (newest && this.#weights.get(newest.cell)?.[newest.level - 1]) ?? 0;
   }
 
   /** Sets the opacities of what is stored. */
@@ -295,16 +351,12 @@ function startWorker(answered: (answer: Answer) => void, failed: () => void): Wo
 
 const total = (parts: readonly Handle[]) => parts.reduce((sum, part) => sum + part.count, 0);
 
-/** The label colours by id. */
-export const colorsOf = ({ labels }: Manifest): Map<number, string> =>
-  new Map(labels.map(({ id, color }) => [id, color]));
-
 const rgbOf = (color: string): Vector3 => {
   const [r = 0, g = 0, b = 0] = [1, 3, 5].map((at) => Number.parseInt(color.slice(at, at + 2), 16) / 255);
   return new Vector3(r, g, b);
 };
 
-/** Mixes in a label's colour at the brightness of the scene. */
+/** Mixes in a cell's colour at the brightness of the scene. */
 function tinted(color: Color, amount: InstanceType<typeof dyno.DynoFloat>) {
   const vec3 = (x: number, y: number, z: number) => dyno.dynoConst("vec3", [x, y, z]);
   return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {

@@ -15,6 +15,7 @@ import { SparkLayer } from "./spark";
 
 const FOV = 60; // degrees, of the window's shorter side, unless a photo's lens is set
 const NEAR = 0.03; // metres
+const LONGEST_HOLD = 600; // ms that a picture stays for want of the next one
 const FAR = 1e5; // beyond the sky of a large scene: up to 100 scene extents away
 
 /** The canvas: one camera and the adapted scene, beside the full scene while they are compared. */
@@ -28,6 +29,7 @@ export class Stage {
   needsFrame = true;
   #photo: Camera | null = null;
   #fovY: number | null = null;
+  #heldSince = Number.NaN; // ms
 
   /** Throws without WebGL 2. */
   constructor(
@@ -126,12 +128,16 @@ export class Stage {
     this.renderer.forceContextLoss();
   }
 
-  draw(): void {
+  /** Draws a frame. After a jump the earlier one may stay until what has come into sight is sorted; says so. */
+  draw(mayHold = false): boolean {
     this.needsFrame = false;
     const { renderer, camera } = this;
+    const view = this.viewpoint();
+    for (const layer of [this.layer, this.full]) layer?.cull(view);
+    if (this.#holds(view, mayHold && !renderer.xr.isPresenting)) return false;
     if (!this.full || renderer.xr.isPresenting) {
       renderer.render(this.layer.scene, camera);
-      return;
+      return true;
     }
     const size = renderer.getSize(new Vector2());
     const at = Math.round(size.x * this.split);
@@ -141,6 +147,22 @@ export class Stage {
     renderer.setScissor(at, 0, size.x - at, size.y);
     renderer.render(this.layer.scene, camera);
     renderer.setScissorTest(false);
+    return true;
+  }
+
+  /** Whether the earlier frame stays, while the next one is sorted. */
+  #holds(view: Viewpoint, may: boolean): boolean {
+    const late = [this.layer, this.full].filter((layer) => layer?.misses(view));
+    if (!late.length) {
+      this.#heldSince = Number.NaN;
+      return false;
+    }
+    const now = performance.now();
+    if (Number.isNaN(this.#heldSince)) this.#heldSince = now;
+    if (!may || now - this.#heldSince > LONGEST_HOLD) return false;
+    for (const layer of late) void layer?.spark.update({ scene: layer.scene, camera: this.camera });
+    this.invalidate(); // Spark says once that it is dirty, until it draws
+    return true;
   }
 
   /** Updates the projection after a change of size or lens, or a headset session. */

@@ -4,16 +4,17 @@ import { Streamer } from "../core/streamer";
 import type { Embed, Options, Sample } from "../embed";
 import type { Source } from "../inside";
 import type { Budget, Manifest, Pose, Quality, Settings, State } from "../types";
+import { colorsOf } from "./colors";
 import { Compare } from "./compare";
 import { Controls } from "./controls";
 import { Editor } from "./editor";
 import { quat, transformPose, vec3 } from "./frame";
 import { type Rig, rigAt } from "./motion";
-import { colorsOf } from "./spark";
 import { Stage } from "./stage";
 import { Headset } from "./xr";
 
 const CACHE = 128e6; // bytes of decoded increments that are not shown
+const AROUND = 0.05; // of the scene's bytes, for what a turn of the head shows
 const UNLIMITED: Budget = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
 const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel: more costs fill rate without a visible gain
 
@@ -34,7 +35,7 @@ export class Viewer {
   readonly #samples = new Set<(sample: Sample) => void>();
   #cap: number | null = null; // splat limit of the headset
   #tint = 0;
-  #colors: ReadonlyMap<number, string> = new Map();
+  #shaded = false;
   #last = 0;
 
   /**
@@ -133,16 +134,16 @@ export class Viewer {
   startCompare(): void {
     this.compare.start(() => this.stage.invalidate());
     for (const label of this.#hidden) this.stage.full?.setVisible(label, false);
-    this.stage.full?.setColors(this.#colors);
-    this.stage.full?.setTint(this.#tint);
+    this.setTint(this.#tint, this.#shaded);
   }
 
-  /** Sets the share of the label colours that is mixed in, 0 to 1; optionally other colours by label. */
-  setTint(amount: number, colors?: ReadonlyMap<number, string>): void {
+  /** Sets the share of the label colours that is mixed in, 0 to 1; `shaded`: of shades that tell cells apart. */
+  setTint(amount: number, shaded = false): void {
     this.#tint = amount;
-    this.#colors = colors ?? colorsOf(this.streamer.manifest);
+    this.#shaded = shaded;
+    const colors = colorsOf(this.streamer.manifest, shaded);
     for (const layer of [this.stage.layer, this.stage.full]) {
-      layer?.setColors(this.#colors);
+      layer?.setColors(colors);
       layer?.setTint(amount);
     }
   }
@@ -223,8 +224,9 @@ export class Viewer {
       this.frameMs = Number.NaN;
       return;
     }
-    stage.draw();
+    const isDrawn = stage.draw(true);
     this.streamer.update(stage.viewpoint());
+    if (!isDrawn) return;
     this.frameMs = Number.isNaN(this.frameMs) ? frameMs : this.frameMs + (frameMs - this.frameMs) * 0.1;
     this.#sample(now, frameMs);
   }
@@ -264,6 +266,7 @@ function startSettings(manifest: Manifest, options: Options): Settings {
     budget: { ...UNLIMITED, bytes },
     weights: new Map(manifest.labels.map(({ id, weight }) => [id, weight])),
     cacheBytes: CACHE,
+    aroundBytes: AROUND * manifest.totals.bytes,
   };
 }
 

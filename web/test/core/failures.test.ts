@@ -8,7 +8,7 @@ import { shown, world } from "../world";
 const made = () => {
   const w = world({ labels: 3, levels: 4 });
   w.set({ mode: "full" });
-  const file = w.manifest.labels[1]?.levels[2]?.uri ?? "";
+  const file = w.manifest.labels[1]?.cells[0]?.levels[2]?.uri ?? "";
   const asked = () => w.network.asked.filter((path) => path === file).length;
   return { w, file, asked };
 };
@@ -37,7 +37,7 @@ test.each<[string, Fault, string, number]>([
 
 test("a first level that is broken leaves its label away", async () => {
   const { w } = made();
-  const file = w.manifest.labels[2]?.levels[0]?.uri ?? "";
+  const file = w.manifest.labels[2]?.cells[0]?.levels[0]?.uri ?? "";
   w.network.faults.set(file, "corrupt");
   await w.run();
   expect(shown(w.streamer.state)).toEqual([4, 4, 0]);
@@ -47,7 +47,7 @@ test("a first level that is broken leaves its label away", async () => {
 
 test("nothing is promised for what is missing, and of what is drawn no more than it keeps", async () => {
   const { w, file } = made();
-  const first = w.manifest.labels[0]?.levels[0]?.uri ?? "";
+  const first = w.manifest.labels[0]?.cells[0]?.levels[0]?.uri ?? "";
   w.network.faults.set(first, ["offline", "offline"]);
   w.network.faults.set(file, 404); // level 3 of label 1
   const least = () => leastPromise(w.streamer.state.labels);
@@ -138,7 +138,7 @@ test("waits between tries grow, and a failure is told of after some", async () =
   const waits = times.slice(1).map((time, i) => Math.round((time - (times[i] ?? 0) - 100) / 100) / 10);
   expect(waits.slice(0, 8)).toEqual([0.5, 1, 2, 4, 8, 15, 15, 15]);
   expect(streamer.state.labels[1]?.error).toContain("the server said 500; label 1 waits, trying again");
-  expect(streamer.state.labels.map((label) => label.shown)).toEqual([4, 2, 4]);
+  expect(shown(streamer.state)).toEqual([4, 2, 4]);
 });
 
 test("offline for a minute: what is drawn stays, it is told, and all comes when the link is back", async () => {

@@ -15,6 +15,7 @@ const plain = bundle(network, { labels: 2, levels: 2, bytes: 100 });
 const promises = JSON.parse(new TextDecoder().decode(network.files.get("promises-1.json")));
 const packed = bundle(network, { labels: 2, levels: 2, bytes: 100, pack: true });
 const streams = bundle(network, { labels: 2, levels: 3, bytes: 100, streams: true });
+const parted = bundle(network, { labels: 2, cells: 3, levels: 2, bytes: 100, streams: true, pack: true });
 
 /** A document with another value at a path such as labels.0.id; undefined takes it away. */
 function changed(document: unknown, path: string, value: unknown): string {
@@ -46,21 +47,21 @@ test("the types are those of the schema", async () => {
 });
 
 test("a good manifest is taken as it is, with fields of later versions", () => {
-  for (const made of [plain, packed, streams]) {
+  for (const made of [plain, packed, streams, parted]) {
     expect(parseManifest(JSON.stringify(made))).toEqual(JSON.parse(JSON.stringify(made)));
   }
   for (const [path, value] of [
     ["labels", []],
     ["labels.0.quality", {}],
-    ["labels.0.levels.1.refine", "REPLACE"],
-    ["labels.0.levels.1.format", "ply"],
+    ["labels.0.cells.0.levels.1.refine", "REPLACE"],
+    ["labels.0.cells.0.levels.1.format", "ply"],
     ["later", { any: "thing" }],
   ] as const) {
     expect(parseManifest(changed(plain, path, value))).toBeTruthy();
   }
-  const weighted = streams.labels[0]?.levels.map((level, k) => ({ ...level, weight: k / 2 }));
-  const found = parseManifest(changed(streams, "labels.0.levels", weighted));
-  expect(found.labels[0]?.levels[1]?.weight).toBe(0.5);
+  const weighted = streams.labels[0]?.cells[0]?.levels.map((level, k) => ({ ...level, weight: k / 2 }));
+  const found = parseManifest(changed(streams, "labels.0.cells.0.levels", weighted));
+  expect(found.labels[0]?.cells[0]?.levels[1]?.weight).toBe(0.5);
 });
 
 test("another version says so, whatever else it holds", () => {
@@ -103,27 +104,31 @@ test.each([
   " a.spz",
   "",
 ])("%j is no path below the bundle", (uri) => {
-  for (const path of ["labels.1.levels.0.uri", "promises.fidelity.uri"]) {
+  for (const path of ["labels.1.cells.0.levels.0.uri", "promises.fidelity.uri"]) {
     expect(refusal(plain, path, uri)).toContain("uri must be a path below the bundle's folder");
   }
 });
 
-const LEVELS = "labels.0.levels";
-const GAPS = "labels[0].levels must be ranges of their stream without gaps, from byte 0 on";
-const ALONE = "labels[0].levels must be one stream of their own";
-const [first, second] = (streams.labels[0]?.levels ?? []) as unknown as [Level, Level];
+const LEVELS = "labels.0.cells.0.levels";
+const GAPS = "labels[0].cells[0].levels must be ranges without gaps";
+const ALONE = "labels[0].cells[0].levels must be one stream, in a file of the label's own";
+const [first, second] = (streams.labels[0]?.cells[0]?.levels ?? []) as unknown as [Level, Level];
 
 test.each<[string, unknown, string, Manifest?]>([
-  [LEVELS, [], "labels[0].levels must be a list of at least 1"],
+  [LEVELS, [], "labels[0].cells[0].levels must be a list of at least 1"],
   ["labels.1.id", 0, "same id"],
-  ["labels.0.boxes", [[1, 0, 0, 0, 0, 0]], "labels[0].boxes"],
-  ["labels.0.boxes", [[1, 0]], "labels[0].boxes[0] must be a list of 6"],
+  ["labels.1.cells.0.id", 0, "cells have the same id twice"],
+  ["labels.0.cells", [], "labels[0].cells must be a list of at least 1"],
+  ["labels.0.cells.0.bounds", [1, 0, 0, 0, 0, 0], "labels[0].cells[0].bounds has a least above its most"],
+  ["labels.0.cells.0.bounds", [1, 0], "labels[0].cells[0].bounds must be a list of 6"],
+  ["labels.0.cells.0.points", [1, 2, 3, 4, 5], "labels[0].cells[0].points must have four numbers a point"],
+  ["labels.0.cells.0.points.0", 256, "labels[0].cells[0].points[0] must be a whole number from 0 to 255"],
   ["labels.0.weight", -1, "labels[0].weight must be a number from 0 on"],
   ["labels.0.color", "red", "labels[0].color must be a colour as #rrggbb"],
-  [`${LEVELS}.0.sha256`, "12", "labels[0].levels[0].sha256 must be a SHA-256 in hexadecimal"],
-  [`${LEVELS}.0.bytes`, 1.5, "labels[0].levels[0].bytes must be a whole number from 1 on"],
+  [`${LEVELS}.0.sha256`, "12", "labels[0].cells[0].levels[0].sha256 must be a SHA-256 in hexadecimal"],
+  [`${LEVELS}.0.bytes`, 1.5, "labels[0].cells[0].levels[0].bytes must be a whole number from 1 on"],
   [`${LEVELS}.0.format`, "ksplat", 'must be "stream" or "spz" or "ply"'],
-  [`${LEVELS}.0.refine`, "REPLACE", "labels[0].levels[0] has nothing to replace"],
+  [`${LEVELS}.0.refine`, "REPLACE", "labels[0].cells[0].levels[0] has nothing to replace"],
   [`${LEVELS}.1.refine`, null, 'levels[1].refine must be "REPLACE"'],
   [`${LEVELS}.1.offset`, 0, "have offsets or weights, which only streams have"],
   ["labels.0.quality.fidelity.mean", [0], "labels[0].quality.fidelity must have a number a level"],
@@ -132,7 +137,6 @@ test.each<[string, unknown, string, Manifest?]>([
   ["labels.0.quality.fidelity.levels.1", 1, "labels[0].quality.fidelity.levels must rise"],
   ["labels.0.quality.fidelity.levels.1", 9, "labels[0].quality.fidelity.levels must rise"],
   ["labels.0.quality.fidelity.mean.1", 2, "labels[0].quality.fidelity.mean[1] must be a number from -1 to 1"],
-  ["labels.0.category", "grass", "labels[0].block is missing"],
   ["target.quality", "psnr", 'target.quality must be "fidelity" or "ssim"'],
   ["target.value", null, "target.value must be a number"],
   ["frame.axes", "rdf", 'frame.axes must be "rub"'],
@@ -148,6 +152,13 @@ test.each<[string, unknown, string, Manifest?]>([
   ["pack.order.0", [0, 2], "pack.order must name levels", packed],
   [`${LEVELS}.0.offset`, undefined, GAPS, streams],
   [`${LEVELS}.0.offset`, 1, GAPS, streams],
+  ["labels.0.cells.1.levels.0.offset", 1, "labels[0].cells[1].levels must be ranges without gaps", parted],
+  [
+    "labels.0.cells",
+    parted.labels[0]?.cells.slice(1),
+    "labels[0].cells must have ranges that fill their file, from byte 0 on",
+    parted,
+  ],
   [`${LEVELS}.1.offset`, (second.offset ?? 0) + 1, GAPS, streams],
   [`${LEVELS}.1.offset`, (second.offset ?? 0) - 1, GAPS, streams],
   [`${LEVELS}.1.offset`, 0.5, "levels[1].offset must be a whole number from 0 on", streams],
@@ -155,12 +166,12 @@ test.each<[string, unknown, string, Manifest?]>([
   [`${LEVELS}.1.uri`, "chunks/other.sgst", ALONE, streams],
   [`${LEVELS}.1.format`, "spz", ALONE, streams],
   [`${LEVELS}.1.refine`, "REPLACE", ALONE, streams],
-  [`${LEVELS}.1.weight`, 0.5, "labels[0].levels must all have a weight, or none", streams],
+  [`${LEVELS}.1.weight`, 0.5, "labels[0].cells[0].levels must all have a weight, or none", streams],
   [`${LEVELS}.1.weight`, 1.5, "levels[1].weight must be a number from 0 to 1", streams],
   [
-    "labels.1.levels",
-    streams.labels[1]?.levels.map((level) => ({ ...level, uri: first.uri })),
-    "labels[1].levels must be one stream of their own",
+    "labels.1.cells.0.levels",
+    streams.labels[1]?.cells[0]?.levels.map((level) => ({ ...level, uri: first.uri })),
+    "labels[1].cells[0].levels must be one stream, in a file of the label's own",
     streams,
   ],
 ])("%s = %j", (path, value, message, document = plain) => {
@@ -190,24 +201,25 @@ test.each([
   ["screens", [2, 0.5], "screens must be from the smaller to the larger"],
   ["views.0", [1], "views and photos must have columns of equal length"],
   ["views.0.1", 0.5, "views[0][1] must be a whole number"],
-  ["labels.0.shares", [5000], "labels[0] has lists"],
-  ["labels.0.shares.0", 20_000, "labels[0] has shares or corrections out of range"],
-  ["labels.0.corrections.0", 1e9, "labels[0] has shares or corrections out of range"],
-  ["labels.0.views", [0, 99], "labels[0] has lists"],
-  ["labels.0.views.1", 99, "labels[0] has lists"],
-  ["labels.0.values.steps", [], "labels[0] has lists"],
-  ["labels.0.values.steps.0", [1], "labels[0] has lists"],
-  ["labels.0.values.steps.0.0", 1e10, "labels[0] has values out of range"],
-  ["labels.0.values.units.0", 0, "labels[0].values.units[0] must be a number from"],
-  ["labels.0.values.units", [1], "labels[0] has lists"],
-  ["labels.0.offsets", [0], "labels[0] has lists"],
+  ["labels.0.cells.0.factors", [5000], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.factors.0", 2e6, "labels[0].cells[0] has factors, shares or corrections out of range"],
+  ["labels.0.cells.0.corrections", [1], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.id", -1, "labels have models of cells for fidelity, of the whole label for ssim"],
+  ["labels.0.cells.0.views", [0, 99], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.views.1", 99, "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.values.steps", [], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.values.steps.0", [1], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.values.steps.0.0", 1e10, "labels[0].cells[0] has values out of range"],
+  ["labels.0.cells.0.values.units.0", 0, "labels[0].cells[0].values.units[0] must be a number from"],
+  ["labels.0.cells.0.values.units", [1], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.offsets", [0], "labels[0].cells[0] has lists"],
   [
-    "labels.0.curves",
+    "labels.0.cells.0.curves",
     [{ level: 1, params: [1, 0, 0, 1, 1, 0, 0, 1, 0], range: [0, 1], median: 1 }],
-    "labels[0] has lists",
+    "labels[0].cells[0] has lists",
   ],
-  ["labels.0.logDistances.steps.0", 1e6, "labels[0] has values out of range"],
-  ["labels.0.levels", [2, 1], "labels[0].levels must rise"],
+  ["labels.0.cells.0.logDistances.steps.0", 1e6, "labels[0].cells[0] has values out of range"],
+  ["labels.0.cells.0.levels", [2, 1], "labels[0].cells[0].levels must rise"],
   ["labels.0.lengths", [1, 0, 1, 1], "labels[0].lengths[1]"],
   ["labels.0.lengths", [1, 1, 1], "labels[0].lengths must be a list of 4"],
   ["labels.0.thresholds", [1, 2], "labels[0] has lists"],

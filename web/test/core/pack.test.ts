@@ -12,7 +12,8 @@ const made = (options: Options = {}, more: Partial<StreamerOptions> = {}) => {
   const { asked } = w.network;
   const chunks = () => asked.filter((path) => path.startsWith("chunks/"));
   const twice = () => asked.filter((path, i) => asked.indexOf(path) < i);
-  const file = (label: number, level: number) => w.manifest.labels[label]?.levels[level - 1]?.uri ?? "";
+  const file = (label: number, level: number) =>
+    w.manifest.labels[label]?.cells[0]?.levels[level - 1]?.uri ?? "";
   return { w, chunks, twice, file };
 };
 

@@ -7,7 +7,7 @@ import { NO_BUDGET, type Options } from "../worlds";
 
 const made = (options: Options = {}) => {
   const w = world({ labels: 3, levels: 4, bytes: 4000, streams: true, ...options });
-  const file = (label: number) => w.manifest.labels[label]?.levels[0]?.uri ?? "";
+  const file = (label: number) => w.manifest.labels[label]?.cells[0]?.levels[0]?.uri ?? "";
   const asked = (label: number) => w.network.asked.filter((path) => path === file(label)).length;
   const total = w.manifest.totals.bytes + (w.manifest.promises.fidelity?.bytes ?? 0);
   return { w, file, asked, total };
@@ -35,7 +35,7 @@ test("levels of one request are drawn as they come", async () => {
 test("what the plan does not want is not loaded", async () => {
   const { w } = made({ levels: 12 });
   await w.run({ mode: "base" });
-  const lowest = w.manifest.labels.reduce((sum, { levels }) => sum + (levels[0]?.bytes ?? 0), 0);
+  const lowest = w.manifest.labels.reduce((sum, { cells }) => sum + (cells[0]?.levels[0]?.bytes ?? 0), 0);
   expect(w.streamer.state.bytesLoaded).toBe(lowest + (w.manifest.promises.fidelity?.bytes ?? 0));
   await w.run({ mode: "target", target: 0.7 });
   expect(shown(w.streamer.state)).toEqual(wanted(w.streamer.state));

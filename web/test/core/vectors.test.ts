@@ -1,155 +1,249 @@
-/** Promises and distances against those of the Python package. */
+/** How viewpoints see cells, and promises: by hand, and against those of the Python package. */
 
 import { describe, expect, test } from "vitest";
-import distances from "../../../tests/data/distances.json?raw";
 import promised from "../../../tests/data/promises.json?raw";
-import { type Lens, look, photoFrustum, rotate, touches, widestLens } from "../../src/core/distance";
-import { anywhere, curveAt, ViewModel, Views } from "../../src/core/quality";
-import type { Box, Camera, Curve, Label, Promises, Quat, Vec3, Viewpoint } from "../../src/types";
-import { differences, frustumOf } from "../worlds";
+import { Points } from "../../src/core/distance";
+import {
+  boundOf,
+  curveAt,
+  LabelModel,
+  meansAnywhere,
+  neededFor,
+  outlookAnywhere,
+  Views,
+} from "../../src/core/quality";
+import { entriesOf } from "../../src/core/residency";
+import { familiesOf, ViewpointModels } from "../../src/core/viewpoints";
+import type { Cell, CellPromises, Curve, Label, Promises, Viewpoint } from "../../src/types";
+import { Network, VirtualClock } from "../simulate";
+import { at, bundle, differences, frustumOf, modelsOf } from "../worlds";
 
-interface PromiseCase {
-  name: string;
-  promises: Promises;
-  viewpoints: {
-    position: Vec3;
-    direction: Vec3;
-    focal: number | null;
-    distance: number | null;
-    corrected: number | null;
-    mean: number[];
-    bound: (number | null)[];
-    support: number;
+/** Numbers of one viewpoint; null: NaN. */
+interface Seen {
+  readonly viewpoint: Omit<Viewpoint, "focal"> & { readonly focal: number | null };
+  readonly cells: { readonly id: number; readonly share: number; readonly mean: (number | null)[] }[];
+  readonly labels: {
+    readonly id: number;
+    readonly support: number;
+    readonly bound: number | null; // of the composition
+    readonly levels: number[]; // of it, from 1, by cell
   }[];
+  readonly away: number | null; // from the photos
+}
+interface PromiseCase {
+  readonly name: string;
+  readonly cells?: (Cell & { readonly label: number })[];
+  readonly promises: Promises;
+  readonly viewpoints: Seen[];
 }
 
-interface DistanceCase {
-  name: string;
-  boxes: Box[];
-  camera: { position: Vec3; quaternion: Quat; fovY: number; aspect: number };
-  frustum: Viewpoint["frustum"];
-  lens: Lens;
-  photo: Viewpoint["frustum"];
-  expected: { distance: number | null; inPhoto: number | null; visible: boolean; touching: boolean[] };
+function near(found: number, expected: number | null, what: string): void {
+  if (expected === null) expect(found, what).toBeNaN();
+  else expect(Math.abs(found - expected), what).toBeLessThanOrEqual(1e-9 * Math.max(1, Math.abs(expected)));
 }
 
-function near(found: readonly number[], expected: readonly number[], relative = 0): void {
-  expect(found).toHaveLength(expected.length);
-  expected.forEach((value, i) => {
-    const away = Math.abs((found[i] ?? Number.NaN) - value);
-    expect(away).toBeLessThanOrEqual(1e-9 * Math.max(1, relative * Math.abs(value)));
-  });
-}
-
-const labelWith = (levels: number): Label => ({
-  id: 7,
+const level = { uri: "a.spz", format: "spz", bytes: 1, gpuBytes: 1, count: 1, sha256: "" } as const;
+const labelOf = (id: number, cells: readonly Cell[]): Label => ({
+  id,
   name: "label",
   title: "label",
   color: "#000000",
   weight: 1,
   always: false,
-  boxes: [],
-  levels: Array.from({ length: levels }, () => ({
-    uri: "a.spz",
-    format: "spz",
-    bytes: 1,
-    gpuBytes: 1,
-    count: 1,
-    sha256: "",
-  })),
+  cells,
   quality: {},
 });
 
-describe("promises", () => {
-  for (const c of (JSON.parse(promised) as { cases: PromiseCase[] }).cases) {
-    test(c.name, () => {
-      const own = c.promises.labels[0];
-      if (!own) throw new Error("no label");
-      const label = labelWith(Math.max(...own.levels));
-      expect(ViewModel.fits(label, own)).toBe(true);
-      const model = new ViewModel(label, new Views(c.promises), own);
-      const ofLevels = (values: readonly number[]) => own.levels.map((k) => values[k - 1] ?? Number.NaN);
-      for (const v of c.viewpoints) {
-        const { position, direction, focal } = v;
-        const from = { position, direction, ...(focal !== null && { focal }) };
-        const told = model.predict(v.distance ?? Number.NaN, from);
-        near(ofLevels(told.mean), v.mean);
-        v.bound.forEach((value, k) => {
-          if (value === null) expect(ofLevels(told.bound)[k]).toBeNaN();
-          else near([ofLevels(told.bound)[k] ?? Number.NaN], [value]);
-        });
-        near([told.support], [v.support]);
-        const outside = v.support < own.leastSupport;
-        expect(told.trust).toBe(outside ? "outside" : own.targets.length ? own.status : "unknown");
-        const right = model.corrected(v.distance ?? Number.NaN, from);
-        if (v.corrected === null) expect(right).toBeNaN();
-        else near([right], [v.corrected], 1);
-        label.levels.forEach((_, k) => {
-          expect(Number.isNaN(told.mean[k])).toBe(!own.levels.includes(k + 1));
-        });
+const cases = (JSON.parse(promised) as { cases: PromiseCase[] }).cases.filter(({ cells }) => cells);
+test.skipIf(!cases.length)("promises are those of the Python package", () => {
+  for (const { name, cells = [], promises, viewpoints } of cases) {
+    const ids = [...new Set(cells.map(({ label }) => label))];
+    const labels = ids.map((id) =>
+      labelOf(
+        id,
+        cells.filter(({ label }) => label === id),
+      ),
+    );
+    const families = familiesOf(entriesOf(labels));
+    const models = new ViewpointModels(promises.quality, labels, promises);
+    for (const { viewpoint, cells: seen, labels: expected } of viewpoints) {
+      const { focal, ...from } = viewpoint;
+      models.see(families, { ...from, ...(focal !== null && { focal }) });
+      for (const family of families) {
+        const told = expected.find(({ id }) => id === family.label.id);
+        let [sum, total] = [0, 0];
+        for (const [i, entry] of family.entries.entries()) {
+          const own = seen.find(({ id }) => id === entry.cell.id);
+          near(entry.share, own?.share ?? 0, `${name}: share`);
+          const means = entry.sight.visible ? (own?.mean ?? []) : [];
+          for (const [k, mean] of means.entries()) near(entry.mean[k] ?? 0, mean, `${name}: mean`);
+          if (entry.share > 0) sum += entry.share * (entry.mean[(told?.levels[i] ?? 0) - 1] ?? Number.NaN);
+          total += entry.share;
+        }
+        if (!told || !family.entries.some(({ sight }) => sight.visible)) continue;
+        near(family.outlook.support, told.support, `${name}: support`);
+        const { keeps } = family.outlook;
+        near(keeps ? boundOf(keeps, sum / total) : Number.NaN, told.bound, `${name}: bound`);
       }
-    });
+    }
   }
 });
 
-describe("distances", () => {
-  for (const c of (JSON.parse(distances) as { cases: DistanceCase[] }).cases) {
-    test(c.name, () => {
-      const { position, quaternion, fovY, aspect } = c.camera;
-      const planes = frustumOf(position, quaternion, fovY, aspect);
-      near(planes.flat(), c.frustum.flat());
-      const viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: planes };
-      const sight = look(c.boxes, viewpoint);
-      expect(sight.visible).toBe(c.expected.visible);
-      expect(c.boxes.map((box) => touches(box, planes))).toEqual(c.expected.touching);
-      if (c.expected.distance === null) expect(sight.distance).toBeNaN();
-      else near([sight.distance], [c.expected.distance], 1);
-      const photo = photoFrustum(viewpoint, c.lens);
-      near(photo.flat(), c.photo.flat());
-      const inPhoto = look(c.boxes, viewpoint, photo);
-      if (c.expected.inPhoto === null) expect(inPhoto.distance).toBeNaN();
-      else near([inPhoto.distance], [c.expected.inPhoto], 1);
-      expect({ ...inPhoto, distance: 0 }).toEqual({ ...sight, distance: 0 });
+describe("points", () => {
+  /** Two points at x = 1 and x = 3, of a quarter and three quarters of the area. */
+  const cell: Cell = {
+    id: 0,
+    bounds: [1, 0, -2, 3, 0, -2],
+    points: [0, 0, 0, 50, 255, 0, 0, 150],
+    area: 4,
+    radius: 0.5,
+    levels: [level],
+  };
+  const view: Viewpoint = { ...at(0), lens: [1, 0.5] };
+
+  test("stand for an area that is as large as it is near", () => {
+    const { visible, distance, apparent, potential } = new Points(cell).look(view);
+    expect(visible).toBe(true);
+    expect(apparent).toBeCloseTo((1 / 2) * (1 / 5 + 3 / 13), 12);
+    expect(potential).toBe(apparent);
+    expect(distance).toBeCloseTo(Math.sqrt(5), 12); // a quarter of the weight is there
+  });
+
+  test("count by how far they are inside", () => {
+    const upTo = (x: number): Viewpoint => ({ ...view, frustum: [[-1, 0, 0, x]] });
+    const points = new Points(cell);
+    expect(points.look(upTo(1.25)).apparent).toBeCloseTo((0.75 * 1) / 2 / 5, 12);
+    expect(points.look(upTo(3)).apparent).toBeCloseTo((1 / 2) * (1 / 5 + 1.5 / 13), 12);
+    expect(points.look(upTo(3)).distance).toBeCloseTo(Math.sqrt(5), 12);
+    const behind = points.look(upTo(0.5));
+    expect(behind).toMatchObject({ visible: false, distance: Number.NaN, apparent: 0 });
+    expect(behind.potential).toBeCloseTo((1 / 2) * (1 / 5 + 3 / 13), 12);
+  });
+
+  test("of all cells say how far a label is", () => {
+    const far = { ...cell, id: 1, bounds: [1, 0, -20, 3, 0, -20] } as const;
+    const both = [new Points(far), new Points(cell)];
+    for (const points of both) points.look(view);
+    expect(Points.together(both)).toBeCloseTo(Math.sqrt(5), 12);
+    for (const points of both) points.look({ ...view, frustum: [[0, 0, 1, -5]] });
+    expect(Points.together(both)).toBeNaN();
+  });
+
+  test("where there are none, or of no area, nothing is in sight", () => {
+    for (const points of [[], [1, 2, 3, 0]]) {
+      expect(new Points({ ...cell, points }).look(view)).toMatchObject({ visible: false, potential: 0 });
+    }
+    const here = new Points({ ...cell, bounds: [0, 0, 0, 0, 0, 0], radius: 0 }).look(view);
+    expect(here.apparent).toBeLessThan(Infinity);
+  });
+});
+
+const promises = (): { labels: readonly Label[]; promises: Promises } => {
+  const network = new Network(new VirtualClock());
+  const { labels } = bundle(network, { labels: 2, cells: 2 });
+  return { labels, promises: JSON.parse(new TextDecoder().decode(network.files.get("promises-1.json"))) };
+};
+
+describe("models", () => {
+  const facing = { ...at(0), frustum: frustumOf([0, 0, 0], [0, 0, 0, 1], 2, 2) };
+
+  test("shares of cells are at most the picture, by what is known nearby", () => {
+    const { labels, promises: sent } = promises();
+    const all = (factors: number[]): Promises => ({
+      ...sent,
+      labels: sent.labels.map((one) => ({
+        ...one,
+        cells: one.cells.map((own) => ({ ...own, factors: differences(factors) })),
+      })),
     });
-  }
-});
+    const shares = (factors: number[], viewpoint = at(-6)) => {
+      const families = familiesOf(entriesOf(labels));
+      new ViewpointModels("fidelity", labels, all(factors)).see(families, viewpoint);
+      return families.flatMap(({ entries }) => entries);
+    };
+    const views = sent.views[0].length;
+    const plain = shares(Array(views).fill(20));
+    for (const { share, sight } of plain) expect(share).toBeCloseTo(sight.apparent, 12);
+    for (const { share, sight } of shares(Array(views).fill(10))) {
+      expect(share).toBeCloseTo(0.5 * sight.apparent, 12);
+    }
+    for (const { share, sight } of shares(Array(views).fill(-1))) expect(share).toBe(sight.apparent);
+    const crowded = shares(Array(views).fill(200_000));
+    expect(crowded.reduce((sum, { share }) => sum + share, 0)).toBeCloseTo(1, 9);
+    // a view that is here decides
+    const { extent } = sent;
+    const x = (sent.views[0][0] ?? 0) * 1e-4 * extent;
+    const z = (sent.views[2][0] ?? 0) * 1e-4 * extent;
+    const one = shares([0, ...Array(views - 1).fill(-1)], at(x, 0, z));
+    for (const { share, sight } of one) expect(share).toBeLessThanOrEqual(1e-2 * sight.apparent);
+  });
 
-test("a frustum that is no wider than the photos is that of the window", () => {
-  const viewpoint = {
-    position: [0, 0, 0],
-    direction: [0, 0, -1],
-    frustum: frustumOf([0, 0, 0], [0, 0, 0, 1], 1, 1),
-  };
-  const window = viewpoint as unknown as Viewpoint;
-  expect(photoFrustum(window, [0.6, 0.6])).toBe(window.frustum);
-  expect(photoFrustum(window, null)).toBe(window.frustum);
-  expect(photoFrustum({ ...window, frustum: [] }, [0.1, 0.1])).toEqual([]);
-});
+  test("a cell that no view shows has the mean that is sent, and its label's promise", () => {
+    const { labels, promises: sent } = promises();
+    const bare = (own: CellPromises): CellPromises => ({
+      ...own,
+      views: [],
+      logDistances: { unit: 0.01, steps: [] },
+      values: { units: own.values.units, steps: own.levels.map(() => []) },
+    });
+    const all = {
+      ...sent,
+      labels: sent.labels.map((one) => ({ ...one, leastSupport: 0.01, cells: one.cells.map(bare) })),
+    };
+    const families = familiesOf(entriesOf(labels));
+    const models = new ViewpointModels("fidelity", labels, all);
+    models.see(families, at(-6));
+    for (const { entries, outlook, label } of families) {
+      expect(outlook.trust).toBe("calibrated");
+      for (const { mean } of entries) expect(mean).toEqual(label.quality.fidelity?.mean);
+    }
+    models.see(families, at(1e4));
+    for (const { outlook } of families) expect(outlook).toMatchObject({ keeps: null, trust: "outside" });
+  });
 
-test("the lens is that of the photos, and of other shapes of their area", () => {
-  expect(widestLens([])).toBeNull();
-  const long = { width: 300, height: 40, intrinsics: [100, 160, 150, 20] } as unknown as Camera;
-  const shaped = Math.sqrt((300 * 40 * 20) / 9) / (2 * Math.sqrt(100 * 160)); // of the long one
-  near(widestLens([long, { ...long, width: 30 }]) ?? [], [1.5, shaped]);
-  const square = { ...long, width: 100, height: 100, intrinsics: [100, 100, 50, 50] } as const;
-  const half = Math.sqrt(20 / 9) / 2;
-  near(widestLens([square]) ?? [], [half, half]);
-});
+  test("screens beyond those that are known count as the nearer end, none as the photos'", () => {
+    const { labels, promises: sent } = promises();
+    const label = labels[0] as Label;
+    const views = new Views(sent);
+    const own = sent.labels[0];
+    if (!own) throw new Error("no model");
+    const model = new LabelModel(label, views, own);
+    const from = (screen?: number) => {
+      views.from({ ...facing, ...(screen !== undefined && { focal: screen * sent.focal }) });
+      return [model.cells[0]?.mean(5), model.outlook().support];
+    };
+    expect(sent.screens).toEqual([0.5, 2]);
+    expect(from(9)).toEqual(from(2));
+    expect(from(0.01)).toEqual(from(0.5));
+    expect(from()).toEqual(from(1));
+    expect(from(2)).not.toEqual(from(1));
+  });
 
-test("screens beyond those that are known count as the nearer end, none as the photos'", () => {
-  const { promises } = (JSON.parse(promised) as { cases: PromiseCase[] }).cases[5] ?? {};
-  const own = promises?.labels[0];
-  if (!own) throw new Error("no case");
-  const model = new ViewModel(labelWith(5), new Views(promises), own);
-  const at = (screen?: number) => {
-    const focal = screen === undefined ? {} : { focal: screen * promises.focal };
-    return model.predict(2, { position: [0, 0, 0], direction: [0, 0, -1], ...focal });
-  };
-  expect(promises.screens).toEqual([0.5, 2]);
-  expect(at(9)).toEqual(at(2));
-  expect(at(0.01)).toEqual(at(0.5));
-  expect(at()).toEqual(at(1));
-  expect(at(2).mean).not.toEqual(at(1).mean);
+  test("of ssim all cells of a label have its mean", () => {
+    const { labels, promises: sent } = promises();
+    const whole = {
+      ...sent,
+      quality: "ssim" as const,
+      labels: sent.labels.map((one) => {
+        const [first] = one.cells as readonly [CellPromises];
+        const { factors: _, ...own } = first;
+        return { ...modelsOf({ id: one.id } as Label, []), cells: [{ ...own, id: -1 }] };
+      }),
+    };
+    const families = familiesOf(entriesOf(labels));
+    const models = new ViewpointModels("ssim", labels, whole);
+    models.see(families, at(-6));
+    const settings = { target: 0.8, weights: new Map() } as never;
+    for (const family of families) {
+      const [a, b] = family.entries;
+      expect(a?.mean).toEqual(b?.mean);
+      expect(a?.mean.every((mean) => mean > 0)).toBe(true);
+      const { cells, bound } = models.group(family, settings, ({ cell }) => cell.levels.length);
+      expect(cells).toHaveLength(1);
+      expect(cells[0]?.ladder.bytes[4]).toBe((a?.ladder.bytes[4] ?? 0) + (b?.ladder.bytes[4] ?? 0));
+      expect(bound).toHaveLength(5);
+    }
+  });
 });
 
 const curve: Curve = {
@@ -168,45 +262,33 @@ test("a curve ends where its range ends, and says its median where the distance 
   expect(curveAt(curve, Number.NaN)).toBe(0.7);
 });
 
+test("what a target needs is what keeps it", () => {
+  const keeps = { targets: [0.3, 0.6, 0.9], needed: [0.4, 0.65, 1] };
+  expect(neededFor(keeps, 0.3)).toBeCloseTo(0.4, 12);
+  expect(neededFor(keeps, 0.45)).toBeCloseTo(0.525, 12);
+  expect(neededFor(keeps, 0.1)).toBeCloseTo(0.2, 12);
+  expect(neededFor(keeps, 0.9)).toBe(1);
+  expect(neededFor(keeps, 0.95)).toBe(Infinity);
+  for (const target of [0.05, 0.3, 0.5, 0.6, 0.77, 0.9]) {
+    expect(boundOf(keeps, neededFor(keeps, target))).toBeCloseTo(target, 12);
+  }
+  expect(boundOf(keeps, Number.NaN)).toBeNaN();
+});
+
 test("before the models are there: levels without a prediction are unknown, bounds never fall", () => {
   const known = {
     levels: [2, 3],
     status: "calibrated",
     confidence: 0.95,
-    mean: [0.8, 0.7],
-    bound: [0.6, 0.5],
+    mean: [0.7, 0.8],
+    bound: [0.6, 0.7],
   } as const;
-  const label: Label = { ...labelWith(4), quality: { ssim: known } };
-  const { mean, bound, trust } = anywhere(label, "ssim");
-  expect(mean).toEqual([Number.NaN, 0.75, 0.75, Number.NaN]);
-  expect(bound).toEqual([Number.NaN, 0.6, 0.6, Number.NaN]);
+  expect(meansAnywhere(known, 4)).toEqual([Number.NaN, 0.7, 0.8, Number.NaN]);
+  expect(meansAnywhere({ ...known, mean: [0.8, 0.7] }, 3)).toEqual([Number.NaN, 0.75, 0.75]);
+  expect(meansAnywhere(undefined, 2)).toEqual([Number.NaN, Number.NaN]);
+  const { keeps, trust } = outlookAnywhere(known);
   expect(trust).toBe("calibrated");
-  const unknown = [1, 2, 3, 4].map(() => Number.NaN);
-  const none = anywhere({ ...label, quality: { ssim: { ...known, bound: null } } }, "ssim");
-  expect([none.bound, none.trust]).toEqual([unknown, "unknown"]);
-  expect(anywhere(label, "fidelity")).toMatchObject({ mean: unknown, bound: unknown, trust: "unknown" });
-});
-
-test("shares of pixels come from the views near by", () => {
-  const own = (JSON.parse(promised) as { cases: PromiseCase[] }).cases[4];
-  if (!own?.promises.labels[0]) throw new Error("no case");
-  const count = own.promises.views[0]?.length ?? 0;
-  const shares = differences(Array.from({ length: count }, (_, i) => (i === 3 ? 5000 : 1000)));
-  const entry = { ...own.promises.labels[0], shares, lengths: [0.01, 0.01, 1, 1] as const };
-  const views = new Views(own.promises);
-  const model = new ViewModel(labelWith(6), views, entry);
-  const [x, y, z, a, b, c] = [...views.rows.slice(21, 27)] as [
-    number,
-    number,
-    number,
-    number,
-    number,
-    number,
-  ];
-  const { extent } = own.promises;
-  const there = [x * extent, y * extent, z * extent] as const;
-  for (const focal of [1, 1e4]) // of place alone
-    expect(model.share({ position: there, direction: [a, b, c], focal })).toBeCloseTo(0.5, 6);
-  const away = model.share({ position: [1e4, 0, 0], direction: [0, 0, 1] });
-  expect(away).toBeCloseTo(0.1 + 0.4 / count, 9);
+  expect(keeps && boundOf(keeps, 0.75)).toBeCloseTo(0.65, 12);
+  expect(outlookAnywhere({ ...known, bound: null })).toMatchObject({ keeps: null, trust: "unknown" });
+  expect(outlookAnywhere(undefined)).toMatchObject({ keeps: null, trust: "unknown" });
 });

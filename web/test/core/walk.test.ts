@@ -3,7 +3,7 @@
 import { expect, test } from "vitest";
 import type { Budget, Settings } from "../../src/types";
 import { seeded } from "../simulate";
-import { type World, world } from "../world";
+import { shown, type World, world } from "../world";
 import { at, NO_BUDGET, rightOf } from "../worlds";
 
 type Random = () => number;
@@ -29,8 +29,8 @@ const UNITS = ["bytes", "gpuBytes", "count"] as const;
 
 /** What is drawn, by units, and the smallest that could be. */
 function drawn(w: World) {
-  const files = [...w.renderer.drawn].map((h) => w.manifest.labels[h.label]?.levels[h.level - 1]);
-  const least = w.manifest.labels.map((label) => label.levels[0]);
+  const files = [...w.renderer.drawn].map((h) => w.manifest.labels[h.label]?.cells[0]?.levels[h.level - 1]);
+  const least = w.manifest.labels.map((label) => label.cells[0]?.levels[0]);
   const sum = (of: typeof files, unit: (typeof UNITS)[number]) =>
     of.reduce((all, f) => all + (f?.[unit] ?? 0), 0);
   return UNITS.map((unit) => ({ unit, is: sum(files, unit), least: sum(least, unit) }));
@@ -39,7 +39,10 @@ function drawn(w: World) {
 /** Decoded increments that are not drawn are within the limit, but for those that are just being swapped. */
 function hiddenBytes(w: World): number {
   const hidden = [...w.renderer.alive].filter((handle) => !w.renderer.drawn.has(handle));
-  return hidden.reduce((sum, h) => sum + (w.manifest.labels[h.label]?.levels[h.level - 1]?.gpuBytes ?? 0), 0);
+  return hidden.reduce(
+    (sum, h) => sum + (w.manifest.labels[h.label]?.cells[0]?.levels[h.level - 1]?.gpuBytes ?? 0),
+    0,
+  );
 }
 
 test.each([
@@ -100,7 +103,7 @@ test.each([false, true])(
     w.network.faults.clear();
     await w.pass(30_000);
     await w.rest();
-    expect(w.streamer.state.labels.map((label) => label.shown)).toEqual([4, 4, 4, 4]);
+    expect(shown(w.streamer.state)).toEqual([4, 4, 4, 4]);
     expect(w.streamer.state.message).toBeNull();
   },
 );
