@@ -1,11 +1,13 @@
 """Writes streamed SOG, levels of detail for PlayCanvas's viewers; `lod_meta.py` has the layout."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
@@ -14,32 +16,34 @@ from sagesplat.formats.sog_write import GENERATOR, put_sog, sog_files, sog_order
 from sagesplat.formats.splat import SplatWriter
 from sagesplat.io.files import atomic_folder, write_json
 
-LEAF = 2**17  # Gaussians of the finest level in a leaf, at most
-FILE = 2**19  # in a file, unless a leaf has more
+FILE = 2**19  # Gaussians in a file, unless a cell has more
 _SIGMAS = 3  # that bounds enclose
 
 
 def write_lod_meta(
     folder: Path,
     levels: Sequence[Gaussians],
+    label_of: Mapping[int, int],
     names: Mapping[int, str] | None = None,
     *,
     parents: Mapping[int, str] | None = None,
     antialiased: bool = False,
-    leaf: int = LEAF,
+    largest: int = FILE,
 ) -> int:
     """Write levels of detail as a streamed SOG: `lod-meta.json` and folders of images; `folder` is replaced.
 
-    Space is halved across its longest side until a part has at most `leaf` Gaussians of the finest level.
-    Viewers choose a level for each part. Labels are beside each file (`formats/labels.py`).
+    Each cell is a leaf of the tree, for which viewers choose a level; the cells of a category lie below a
+    node of its name. Bounds hold all levels, because viewers cull by them. Labels are beside each file
+    (`formats/labels.py`).
 
     Args:
         folder: Where to write.
-        levels: Gaussians of each level, the finest first; on any device.
-        names: Category names by label id, for the sidecars.
-        parents: Names of the categories that instances are of, by the instance's label id; likewise.
+        levels: Gaussians of each level, the finest first; on any device. Their label ids are cell ids.
+        label_of: Label id by cell id.
+        names: Category names by label id, for the tree and the sidecars.
+        parents: Names of the categories that instances are of, by the instance's label id; for the sidecars.
         antialiased: How the scene was trained.
-        leaf: Gaussians of the finest level in a part.
+        largest: Gaussians in a file, unless a cell has more.
 
     Returns:
         The size of all files in bytes.
@@ -50,23 +54,29 @@ def write_lod_meta(
     levels = [g.detach().to("cpu") for g in levels]
     if not levels or not all(map(len, levels)):
         raise DataError(f"{folder}: a level without Gaussians; leave it out")
-    tree: dict[str, Any] = {}
-    leaves: list[tuple[dict[str, Any], list[np.ndarray]]] = []
-    _split(tree, [g.means.numpy() for g in levels], [np.arange(len(g)) for g in levels], leaf, leaves)
+    cells = {cell for g in levels for cell in g.counts()}
+    leaves: dict[int, dict[str, Any]] = {
+        cell: {"lods": {}} for cell in sorted(cells, key=lambda cell: (label_of[cell], cell))
+    }
     files: list[str] = []
     with atomic_folder(folder) as fresh:
         for lod, g in enumerate(levels):
-            for number, (part, rows) in enumerate(_files(g, lod, leaves)):
-                name = f"{lod}_{number}"
-                for entry in part:
-                    entry["file"] = len(files)
-                inside = g.select(torch.from_numpy(rows))
+            rows = _rows(g, leaves)
+            _widen(leaves, _extents(g), rows)
+            for number, part in enumerate(_files(rows, largest)):
+                name, first = f"{lod}_{number}", 0
+                for cell in part:
+                    count = len(rows[cell])
+                    leaves[cell]["lods"][str(lod)] = {"file": len(files), "offset": first, "count": count}
+                    first += count
+                inside = _labelled(
+                    g.select(torch.from_numpy(np.concatenate([rows[c] for c in part]))), label_of
+                )
                 (fresh / name).mkdir()
                 made = sog_files(inside, name=f"{folder / name}", antialiased=antialiased)
                 put_sog(fresh / name, made, inside, names or {}, parents or {})
                 files.append(f"{name}/meta.json")
-        _bounds(tree, [_extents(g) for g in levels], {id(node): rows for node, rows in leaves})
-        write_json(fresh / LOD_META, _document(levels, files, tree))
+        write_json(fresh / LOD_META, _document(levels, files, _tree(leaves, label_of, names or {})))
         return sum(path.stat().st_size for path in fresh.rglob("*") if path.is_file())
 
 
@@ -78,52 +88,37 @@ def _document(levels: Sequence[Gaussians], files: list[str], tree: dict[str, Any
     }  # fmt: skip
 
 
-def _split(
-    node: dict[str, Any],
-    means: list[np.ndarray],
-    rows: list[np.ndarray],
-    leaf: int,
-    leaves: list[tuple[dict[str, Any], list[np.ndarray]]],
-) -> None:
-    """Fill a node of the tree with children or `lods`; its rows of each level are appended to `leaves`."""
-    points = means[0][rows[0]]
-    extent = np.ptp(points, axis=0) if len(points) else np.zeros(3)
-    axis = int(extent.argmax())
-    if len(points) <= leaf or not extent[axis]:
-        node["lods"] = {}
-        leaves.append((node, rows))
-        return
-    middle = np.median(points[:, axis])
-    node["children"] = []
-    for low in (True, False):
-        part = [r[(m[r, axis] < middle) == low] for m, r in zip(means, rows, strict=True)]
-        if any(map(len, part)):
-            node["children"].append({})
-            _split(node["children"][-1], means, part, leaf, leaves)
+def _rows(g: Gaussians, leaves: Mapping[int, object]) -> dict[int, np.ndarray]:
+    """Rows of each cell that a level has, in Morton order; cells in the order of the leaves."""
+    order = sog_order(g)
+    ids = g.label_ids.numpy()[order]
+    firsts, ends = (np.searchsorted(ids, list(leaves), side) for side in ("left", "right"))
+    found = zip(leaves, firsts, ends, strict=True)
+    return {cell: order[first:end] for cell, first, end in found if end > first}
 
 
-def _files(
-    g: Gaussians, lod: int, leaves: list[tuple[dict[str, Any], list[np.ndarray]]]
-) -> list[tuple[list[dict[str, int]], np.ndarray]]:
-    """For each file of a level, its entries, which are put into the leaves, and its rows."""
-    files: list[tuple[list[dict[str, int]], list[np.ndarray]]] = []
-    count = FILE + 1
-    for node, rows_of in leaves:
-        if not len(rows := rows_of[lod]):
-            continue
-        if count + len(rows) > FILE:
-            files.append(([], []))
+def _files(rows: Mapping[int, np.ndarray], largest: int) -> list[list[int]]:
+    """The cells of each file of a level: in turn, as many as fit."""
+    files: list[list[int]] = []
+    count = largest
+    for cell, own in rows.items():
+        if count + len(own) > largest:
+            files.append([])
             count = 0
-        entry = {"file": 0, "offset": count, "count": len(rows)}
-        node["lods"][str(lod)] = entry
-        files[-1][0].append(entry)
-        files[-1][1].append(rows[sog_order(g.select(torch.from_numpy(rows)))])
-        count += len(rows)
-    return [(entries, np.concatenate(parts)) for entries, parts in files]
+        files[-1].append(cell)
+        count += len(own)
+    return files
 
 
-def _extents(g: Gaussians) -> np.ndarray:
-    """Lowest and highest corner of each Gaussian, float32 [2, N, 3]."""
+def _labelled(g: Gaussians, label_of: Mapping[int, int]) -> Gaussians:
+    """Gaussians of cells with the label ids of their categories."""
+    cells, column = np.unique(g.label_ids.numpy(), return_inverse=True)
+    labels = np.array([label_of[cell] for cell in cells.tolist()], np.int16)
+    return replace(g, label_ids=torch.from_numpy(labels[column]))
+
+
+def _extents(g: Gaussians) -> Float32[np.ndarray, "2 N 3"]:
+    """Lowest and highest corner of each Gaussian."""
     w, x, y, z = torch.nn.functional.normalize(g.quats, dim=1).unbind(1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
@@ -135,22 +130,42 @@ def _extents(g: Gaussians) -> np.ndarray:
     return torch.stack([g.means - torch.stack(reach, 1), g.means + torch.stack(reach, 1)]).numpy()
 
 
-def _bounds(
-    node: dict[str, Any], extents: list[np.ndarray], rows: dict[int, list[np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Set `bound` of a node and of all below it: the lowest and the highest corner."""
-    if "children" in node:
-        ends = [_bounds(child, extents, rows) for child in node["children"]]
-        low, high = np.min([end[0] for end in ends], 0), np.max([end[1] for end in ends], 0)
-    else:
-        parts = [e[:, r] for e, r in zip(extents, rows[id(node)], strict=True) if len(r)]
-        low, high = (end(np.concatenate([p[i] for p in parts]), 0) for i, end in ((0, np.min), (1, np.max)))
-    node["bound"] = {"min": low.tolist(), "max": high.tolist()}
-    return low, high
+def _widen(
+    leaves: Mapping[int, dict[str, Any]],
+    extents: Float32[np.ndarray, "2 N 3"],
+    rows: Mapping[int, np.ndarray],
+) -> None:
+    """Set `bound` of the leaves so that it holds what they had before and the Gaussians of another level."""
+    for cell, own in rows.items():
+        added = {"min": extents[0, own].min(0).tolist(), "max": extents[1, own].max(0).tolist()}
+        earlier = leaves[cell].get("bound", added)
+        leaves[cell]["bound"] = _around([earlier, added])
+
+
+def _around(bounds: Sequence[Mapping[str, list[float]]]) -> dict[str, list[float]]:
+    """The bound of several."""
+    return {
+        "min": [min(values) for values in zip(*(bound["min"] for bound in bounds), strict=True)],
+        "max": [max(values) for values in zip(*(bound["max"] for bound in bounds), strict=True)],
+    }
+
+
+def _tree(
+    leaves: Mapping[int, dict[str, Any]], label_of: Mapping[int, int], names: Mapping[int, str]
+) -> dict[str, Any]:
+    """The root: a node for each category, with its cells below it."""
+    below: dict[int, list[dict[str, Any]]] = {}
+    for cell, leaf in leaves.items():
+        below.setdefault(label_of[cell], []).append(leaf)
+    nodes: list[dict[str, Any]] = []
+    for label, children in below.items():
+        named = {"name": names[label]} if label in names else {}
+        nodes.append(named | {"bound": _around([leaf["bound"] for leaf in children]), "children": children})
+    return {"bound": _around([node["bound"] for node in nodes]), "children": nodes}
 
 
 WRITER = SplatWriter(
-    write_levels=lambda path, levels, names, parents, antialiased: write_lod_meta(
-        path.parent, levels, names, parents=parents, antialiased=antialiased
+    write_levels=lambda path, levels, label_of, names, parents, antialiased: write_lod_meta(
+        path.parent, levels, label_of, names, parents=parents, antialiased=antialiased
     )
 )

@@ -63,7 +63,8 @@ class SplatReader:
 Names = Mapping[int, str]
 # Of a path: a scene, category names by label id, names of the categories that instances are of, antialiasing.
 WriteScene = Callable[[Path, Gaussians, Names, Names, bool], object]
-WriteLevels = Callable[[Path, Sequence[Gaussians], Names, Names, bool], object]  # the finest first
+# Likewise of levels, the finest first, whose label ids are cell ids; label ids by these precede the names.
+WriteLevels = Callable[[Path, Sequence[Gaussians], Mapping[int, int], Names, Names, bool], object]
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from sagesplat.adapt.ladder import read_prefixes
+from sagesplat.adapt.ladder import NestedLadder, read_prefixes
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Warned
@@ -37,6 +38,7 @@ from sagesplat.stages.compose import classic
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import labels_named
+from sagesplat.train.cells import cells_wanted, split_cells
 from sagesplat.train.early_stopping import spread
 
 _HOLE_VIEWS = 16  # training views in which holes are counted
@@ -189,9 +191,21 @@ def _export_levels(
     job: Job, path: Path, write: WriteLevels, levels: Sequence[int], wanted: Sequence[int]
 ) -> int:
     chosen = sorted(set(levels) or job.ladder.levels, reverse=True)  # the finest is level of detail 0
-    sets = [job.ladder.load(level, wanted) for level in chosen]
+    if isinstance(job.ladder, NestedLadder):
+        label_of = {cell: label for cell, label in job.ladder.label_of.items() if label in wanted}
+        sets = [job.by_cell.load(level, list(label_of)) for level in chosen]
+    else:
+        sets, label_of = _in_cells([job.ladder.load(level, wanted) for level in chosen])
     sets = [g for i, g in enumerate(sets) if len(g) and (i == 0 or len(g) < len(sets[i - 1]))]
-    write(path, sets, job.names(), job.parents_by_id, job.antialiased)
+    write(path, sets, label_of, job.names(), job.parents_by_id, job.antialiased)
     write_offset(path, job.scene.offset)
     _say_offset(job, f"written to {beside(path).name}")
     return len(sets[0]) if sets else 0
+
+
+def _in_cells(sets: Sequence[Gaussians]) -> tuple[list[Gaussians], dict[int, int]]:
+    """Recorded levels with cell ids for label ids, and the label id of each: all are split at once."""
+    means, labels = (torch.cat([getattr(g, name) for g in sets]).numpy() for name in ("means", "label_ids"))
+    cells, label_of = split_cells(means, labels, cells_wanted(max(map(len, sets))))
+    parts = np.split(cells, np.cumsum([len(g) for g in sets])[:-1])
+    return [replace(g, label_ids=torch.from_numpy(own)) for g, own in zip(sets, parts, strict=True)], label_of
