@@ -1,6 +1,7 @@
 """The nested ladder: order, training on compositions, prefixes, chunks, and a whole run with it."""
 
 import csv
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -488,6 +489,11 @@ def test_export_writes_levels_of_detail(finished: Path, tmp_path: Path) -> None:
     assert export_scene(job, path, **options) == len(job.ladder.load(5))
     counts = [len(read_splat(path, lod).gaussians) for lod in range(num_lods(path))]
     assert counts == [len(job.ladder.load(level)) for level in range(5, 0, -1)]
+    categories = json.loads(path.read_text())["tree"]["children"]
+    assert [leaf["lods"]["0"]["count"] for node in categories for leaf in node["children"]] == [
+        job.by_cell.counts[cell, 5] for cell in sorted(job.cells.ids.tolist())
+    ]
+    assert {node["name"] for node in categories} == {job.names()[i] for i in job.cells.labels.tolist()}
     with pytest.raises(RunError, match="lods: not empty"):
         export_scene(job, path, **options)
     again = replace(job, force=True)
