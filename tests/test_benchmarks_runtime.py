@@ -9,13 +9,14 @@ import torch
 
 from benchmarks.runtime import __main__ as runtime
 from benchmarks.runtime import playcanvas, spark
-from benchmarks.runtime.levels import TARGETS, opened, ours
+from benchmarks.runtime.levels import opened, ours
 from benchmarks.runtime.measure import Walked, fidelity
 from benchmarks.runtime.walk import recorded
 from sagesplat.adapt.observe import render_rgb
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.lod_meta_write import write_lod_meta
 from sagesplat.scene.scene import Camera
+from sagesplat.stages.methods import NestedLevels
 from tests.conftest import random_gaussians
 
 EYE = Camera(np.eye(4, dtype=np.float32), np.array([[20, 0, 20], [0, 20, 15], [0, 0, 1]], np.float32), 40, 30)
@@ -196,9 +197,12 @@ def test_a_run_is_measured_on_the_same_walk_each_time(finished_run, tmp_path, ca
     job = opened(finished_run)
     cameras = recorded(job, walk, 5, 1.0, 40)
     assert walk.read_bytes() == made
-    levels = ours(job, job.references, cameras, TARGETS)
-    assert levels.shape[:2] == (3, len(TARGETS))
-    assert (np.diff(levels.sum(2), axis=1) >= 0).all()
+    shares = (0.05, 0.3, 1.0)
+    levels, counts = ours(job, cameras, shares), NestedLevels(job).cell_costs.count
+    assert levels.shape == (3, 2 * len(shares), len(job.cells.ids))
+    assert (np.diff(levels[:, :3].sum(2), axis=1) >= 0).all()
+    taken = counts[np.arange(levels.shape[2]), levels[:, :3] - 1].sum(2)
+    assert (taken <= np.maximum(np.array(shares) * counts[:, -1].sum(), counts[:, 0].sum())).all()
 
 
 def test_levels_of_playcanvas_are_made_once(tmp_path):
@@ -222,7 +226,8 @@ def test_levels_of_playcanvas_are_made_once(tmp_path):
 def test_streamed_sog_of_playcanvas_is_drawn_by_its_budget(finished_run, tmp_path):
     job = opened(finished_run)
     levels = [job.ladder.load(level) for level in (job.ladder.levels[-1], job.ladder.levels[0])]
-    write_lod_meta(tmp_path / "sog", levels, antialiased=job.antialiased, leaf=len(levels[0]) // 4)
+    levels = [job.by_cell.load(level) for level in (job.ladder.levels[-1], job.ladder.levels[0])]
+    write_lod_meta(tmp_path / "sog", levels, job.cells.label_of, antialiased=job.antialiased)
     budgets = [1, len(levels[0]) - 1, len(levels[0])]
     method = playcanvas.StreamedSog(
         "sog", tmp_path / "sog" / "lod-meta.json", budgets, "cpu", job.antialiased

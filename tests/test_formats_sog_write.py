@@ -101,37 +101,63 @@ def test_what_cannot_be_written(tmp_path):
     with pytest.raises(DataError, match="1 Gaussians have a rotation of zeros"):
         write_sog(tmp_path / "a.sog", g)
     with pytest.raises(DataError, match="a level without Gaussians"):
-        write_lod_meta(tmp_path / "a", [make(4, 0), make(0, 0)])
+        write_lod_meta(tmp_path / "a", [make(4, 0), make(0, 0)], {-1: -1, 0: 0})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_levels_of_detail(tmp_path):
-    fine = replace(random_gaussians(900, degree=1), label_ids=torch.arange(900, dtype=torch.int16) % 2)
-    levels = [fine, fine.select(torch.arange(0, 900, 4)), fine.select(torch.arange(3))]
-    size = write_lod_meta(tmp_path / "a", levels, {0: "tree", 1: "sky"}, leaf=200)
+def test_levels_of_detail_have_cells_as_their_tree(tmp_path):
+    cells = torch.arange(900, dtype=torch.int16) % 3  # two of the tree, between them one of the sky
+    label_of, names = {0: 5, 1: 2, 2: 5}, {5: "tree", 2: "sky"}
+    fine = replace(random_gaussians(900, degree=1), label_ids=cells)
+    levels = [fine, fine.select(torch.arange(0, 900, 4)), fine.select(torch.tensor([0, 2]))]
+    size = write_lod_meta(tmp_path / "a", levels, label_of, names, parents={5: "plant"}, largest=600)
     assert size == sum(path.stat().st_size for path in (tmp_path / "a").rglob("*.*"))
     assert num_lods(tmp_path / "a") == 3
     document = json.loads((tmp_path / "a" / "lod-meta.json").read_text())
-    assert document["counts"] == [900, 225, 3]
-    leaves, nodes = [], [document["tree"]]
-    while nodes:
-        node = nodes.pop()
-        nodes += node.get("children", [])
-        leaves += [node] if "lods" in node else []
-    assert max(leaf["lods"]["0"]["count"] for leaf in leaves) <= 200
-    assert len(leaves) == 8
+    assert document["counts"] == [900, 225, 2]
+    assert document["filenames"] == [f"{name}/meta.json" for name in ("0_0", "0_1", "1_0", "2_0")]
+    categories = document["tree"]["children"]
+    assert [(node["name"], len(node["children"])) for node in categories] == [("sky", 1), ("tree", 2)]
+    leaves = [leaf for node in categories for leaf in node["children"]]
+    parts = [[leaf["lods"].get(str(lod)) for leaf in leaves] for lod in range(3)]  # of cells 1, 0, 2
+    assert parts[0] == [{"file": f, "offset": at, "count": 300} for f, at in ((0, 0), (0, 300), (1, 0))]
+    assert parts[1] == [{"file": 2, "offset": 75 * i, "count": 75} for i in range(3)]
+    assert parts[2] == [None, *({"file": 3, "offset": i, "count": 1} for i in range(2))]
     for lod, g in enumerate(levels):
         splat = read_splat(tmp_path / "a", lod)
-        assert splat.names == {label: ("tree", "sky")[label] for label in g.counts()}
-        read = splat.gaussians
-        distances, rows = KDTree(g.means.numpy()).query(read.means.numpy())
+        labels = torch.tensor([label_of[cell] for cell in g.label_ids.tolist()], dtype=torch.int16)
+        assert splat.names == {label: names[label] for label in set(labels.tolist())}
+        assert splat.parents == {5: "plant"}
+        distances, rows = KDTree(g.means.numpy()).query(splat.gaussians.means.numpy())
         assert distances.max() < 0.001
         assert len(np.unique(rows)) == len(g)
-        assert torch.equal(read.label_ids, g.label_ids[rows])
-    first = leaves[0]
-    rows = slice(first["lods"]["0"]["offset"], first["lods"]["0"]["offset"] + first["lods"]["0"]["count"])
-    inside = read_splat(tmp_path / "a" / document["filenames"][first["lods"]["0"]["file"]]).gaussians.means[
-        rows
-    ]
-    assert (inside.amin(0) >= torch.tensor(first["bound"]["min"])).all()
-    assert (inside.amax(0) <= torch.tensor(first["bound"]["max"])).all()
+        assert torch.equal(splat.gaussians.label_ids, labels[rows])
+        for leaf, cell in zip(leaves, (1, 0, 2), strict=True):  # viewers cull by the bound, at any level
+            own = g.means[g.label_ids == cell]
+            assert (own >= torch.tensor(leaf["bound"]["min"])).all()
+            assert (own <= torch.tensor(leaf["bound"]["max"])).all()
+            entry = leaf["lods"].get(str(lod))
+            if entry:
+                file = tmp_path / "a" / document["filenames"][entry["file"]]
+                inside = read_splat(file).gaussians.means[entry["offset"] : entry["offset"] + entry["count"]]
+                assert KDTree(own.numpy()).query(inside.numpy())[0].max() < 0.001
+    for node in (*categories, document["tree"]):
+        below = [child["bound"] for child in node["children"]]
+        assert node["bound"]["min"] == np.min([bound["min"] for bound in below], 0).tolist()
+        assert node["bound"]["max"] == np.max([bound["max"] for bound in below], 0).tolist()
+
+
+def test_the_bound_of_a_cell_holds_the_boxes_of_its_gaussians(tmp_path):
+    g = replace(make(1, 0), means=torch.tensor([[1.0, 2, 3]]), log_scales=torch.tensor([[1.0, 2, 0.5]]).log())
+    g = replace(g, quats=torch.tensor([[1.0, 0, 0, 0]]))
+    half = 0.5**0.5
+    turned = replace(g, quats=torch.tensor([[half, 0, 0, half]]))  # x and y change places
+    g, turned = (replace(some, label_ids=torch.zeros(1, dtype=torch.int16)) for some in (g, turned))
+    write_lod_meta(tmp_path / "a", [g], {0: 0})
+    bound = json.loads((tmp_path / "a" / "lod-meta.json").read_text())["tree"]["bound"]
+    assert bound["min"] == pytest.approx([-2, -4, 1.5])
+    assert bound["max"] == pytest.approx([4, 8, 4.5])
+    write_lod_meta(tmp_path / "b", [g, turned], {0: 0})
+    bound = json.loads((tmp_path / "b" / "lod-meta.json").read_text())["tree"]["bound"]
+    assert bound["min"] == pytest.approx([-5, -4, 1.5], abs=1e-5)
+    assert bound["max"] == pytest.approx([7, 8, 4.5], abs=1e-5)

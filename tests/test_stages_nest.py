@@ -1,6 +1,7 @@
 """The nested ladder: order, training on compositions, prefixes, chunks, and a whole run with it."""
 
 import csv
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -61,9 +62,9 @@ def test_sizes_are_geometric() -> None:
 
 
 def test_everything_is_drawn_more_often_in_the_end() -> None:
-    config, rng = NestConfig(full_share=0.1), np.random.default_rng(0)
+    config, rng = NestConfig(), np.random.default_rng(0)
     for done, share in ((0.0, 0.1), (0.5, 0.5), (1.0, 0.9)):
-        drawn = np.stack([draw_shares(rng, 3, config, done) for _ in range(2000)])
+        drawn = np.stack([draw_shares(rng, np.arange(3), config, done) for _ in range(2000)])
         assert (drawn == 1).all(1).mean() == pytest.approx(0.8 * share, abs=0.04)
         assert ((drawn >= 0.4).all(1) & (drawn < 1).all(1)).mean() > 0.15 * share
         assert drawn.min() >= 0.03 - 1e-6
@@ -73,6 +74,15 @@ def test_everything_is_drawn_more_often_in_the_end() -> None:
         assert parts.mean() == pytest.approx(mean, abs=0.15)  # log-uniform, but for these
         low = np.log(drawn[(drawn < 0.4).any(1)])
         assert abs(np.corrcoef(low.T)[0, 1]) < 0.2  # each category by itself
+
+
+def test_a_prefix_of_a_category_or_one_of_each_cell() -> None:
+    rng, of_cells = np.random.default_rng(0), np.array([0, 0, 1, 1, 1])
+    drawn = np.stack([draw_shares(rng, of_cells, NestConfig(), 0.0) for _ in range(1000)])
+    drawn = drawn[(drawn < 1).all(1)]
+    together = (drawn[:, 0] == drawn[:, 1]) & (drawn[:, 2:] == drawn[:, 2:3]).all(1)
+    assert together.mean() == pytest.approx(0.5, abs=0.06)
+    assert (drawn[together, 0] != drawn[together, 2]).all()
 
 
 @pytest.fixture
@@ -165,8 +175,9 @@ def test_what_is_not_drawn_stays_as_it_is(scene: Scene, monkeypatch) -> None:
     monkeypatch.setattr(nested, "SORT_AT", ())
     start = ordered()
     monkeypatch.setattr(nested, "_DRAWN_FROM", 1e-9)
-    monkeypatch.setattr(nested, "_FULL_SHARE_END", 0.0)
-    config = replace(QUICK, steps=3, full_share=0.0)
+    for share in ("_FULL_SHARE_SHORT", "_FULL_SHARE_END"):
+        monkeypatch.setattr(nested, share, 0.0)
+    config = replace(QUICK, steps=3)
     result = trained(scene, start, config, seed=1)
     moved = (result.gaussians.means != start.gaussians.means).any(1).numpy()
     first = np.isin(np.arange(60), [0, 20, 40])
@@ -181,8 +192,9 @@ def test_the_full_model_trains_second_opacities_and_low_levels_the_first(scene, 
     monkeypatch.setattr(nested, "weight_at", lambda shares: np.float32(shares == 1))
     given = torch.linspace(-1, 1, 60)
     start = replace(ordered(), second_opacities=given)
-    monkeypatch.setattr(nested, "_FULL_SHARE_END", float(full))
-    config = replace(QUICK, steps=2, full_share=float(full))
+    for share in ("_FULL_SHARE_SHORT", "_FULL_SHARE_END"):
+        monkeypatch.setattr(nested, share, float(full))
+    config = replace(QUICK, steps=2)
     result = trained(scene, start, config)
     first = result.gaussians.logit_opacities != start.gaussians.logit_opacities
     assert result.second_opacities is not None
@@ -488,6 +500,11 @@ def test_export_writes_levels_of_detail(finished: Path, tmp_path: Path) -> None:
     assert export_scene(job, path, **options) == len(job.ladder.load(5))
     counts = [len(read_splat(path, lod).gaussians) for lod in range(num_lods(path))]
     assert counts == [len(job.ladder.load(level)) for level in range(5, 0, -1)]
+    categories = json.loads(path.read_text())["tree"]["children"]
+    assert [leaf["lods"]["0"]["count"] for node in categories for leaf in node["children"]] == [
+        job.by_cell.counts[cell, 5] for cell in sorted(job.cells.ids.tolist())
+    ]
+    assert {node["name"] for node in categories} == {job.names()[i] for i in job.cells.labels.tolist()}
     with pytest.raises(RunError, match="lods: not empty"):
         export_scene(job, path, **options)
     again = replace(job, force=True)

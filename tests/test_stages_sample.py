@@ -11,6 +11,7 @@ import pytest
 
 from sagesplat.adapt.fidelity import measure_compositions, measure_levels
 from sagesplat.adapt.observe import RenderedLabels
+from sagesplat.adapt.cell_models import expect, promised
 from sagesplat.adapt.viewpoints import Rule, draw, read_viewpoints
 from sagesplat.core.config import FitConfig, SampleConfig
 from sagesplat.core.errors import RunError
@@ -92,15 +93,13 @@ def test_few_calibration_viewpoints_promise_the_full_model_only(job: Job):
     fit_ladder(job, FitConfig())
     models = fidelity_of(job)
     assert {model.status for model in models.values()} == {"uncalibrated"}
-    for model in models.values():
-        at = (
-            np.array([np.nan]),
-            (model.inputs[:1, :3] * model.extent),
-            model.inputs[:1, 3:6],
-            np.exp(model.inputs[:1, 6]),
-        )
-        bound = model.predict(*at).bound[0]
-        assert np.isnan(bound).all() or (bound[-1] == 1 and bound[0] < 0.5)
+    cameras = [viewpoints_of(job).cameras[0]]
+    expected = expect(models, job.cells, cameras, len(job.ladder.levels))
+    for level in job.ladder.levels:
+        composed = expected.of_composition(np.full(expected.share.shape, level))
+        bound = promised(models, expected, composed)
+        known = np.isfinite(bound)
+        assert (bound[known] == 1).all() if level == job.ladder.levels[-1] else (bound[known] < 0.5).all()
 
 
 def test_own_viewpoints(job: Job, tmp_path: Path):

@@ -16,7 +16,7 @@ from sagesplat.formats.sog_write import GENERATOR, put_sog, sog_files, sog_order
 from sagesplat.formats.splat import SplatWriter
 from sagesplat.io.files import atomic_folder, write_json
 
-FILE = 2**19  # Gaussians in a file, unless a cell has more
+FILE = 2**15  # Gaussians in a file, unless a cell has more: viewers fetch whole files
 _SIGMAS = 3  # that bounds enclose
 
 
