@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sagesplat.adapt.cell_models import expect, promised
 from sagesplat.adapt.fidelity import measure_compositions, measure_levels
 from sagesplat.adapt.observe import RenderedLabels
-from sagesplat.adapt.cell_models import expect, promised
 from sagesplat.adapt.viewpoints import Rule, draw, read_viewpoints
 from sagesplat.core.config import FitConfig, SampleConfig
 from sagesplat.core.errors import RunError
