@@ -261,15 +261,16 @@ def test_levels_of_merged_and_split_cells_are_those_of_before(in_cells: Path, vi
 
 
 def test_models_of_other_categories_follow_their_cells(in_cells: Path, viewer: Path) -> None:
-    made = edited(in_cells, viewer, Split(CAR, "part", {CAR: ((0, 3),)}))
-    before, after = fidelity_of(job_of(in_cells))[184], fidelity_of(job_of(made.path))[184]
-    assert [one.cell for one in after.cells] == ladder_of(made.path).cells_of(184)
-    for one, other in zip(before.cells, after.cells, strict=True):
+    made = edited(in_cells, viewer, Merge(TREE, "unlabelled"))  # whose cells are now numbered first
+    before, after = (job_of(path) for path in (in_cells, made.path))
+    moved = ladder_of(made.path).cells_of(3)
+    assert [cell - len(ladder_of(made.path).cells_of(-1)) for cell in moved] == before.cells.ids.tolist()[:-1]
+    pairs = zip(fidelity_of(before)[3].cells, fidelity_of(after)[3].cells, strict=True)
+    for cell, (one, other) in zip(moved, pairs, strict=True):
+        assert other.cell == cell
         np.testing.assert_array_equal(one.offsets, other.offsets)
-    old, new = (
-        {one.uri for one in increments_of(job_of(p)) if one.label_id == 184} for p in (in_cells, made.path)
-    )
-    assert old == new  # its file is the same
+    files = [{one.uri for one in increments_of(job) if one.label_id == 3} for job in (before, after)]
+    assert files[0] == files[1]
 
 
 def test_scripts_apply_edits(run: Path, tmp_path: Path) -> None:

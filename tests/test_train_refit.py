@@ -133,3 +133,30 @@ def test_cells_of_sets_have_every_level_and_the_same_gaussians(monkeypatch: pyte
     one, other = made.gaussians.means[torch.from_numpy(low_rows)], low.means
     assert np.array_equal(np.sort(one.numpy(), 0), np.sort(other.numpy(), 0))
     assert len(in_cells(ladder, 0)[1]) == len(g.counts())
+
+
+def test_mixed_levels_of_cells_lie_between_the_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sagesplat.train.cells.FEWEST", 40)
+    g = random_gaussians(400, degree=0)
+    g, camera = replace(g, label_ids=torch.zeros_like(g.label_ids)), orbit(1)[0]
+    (rung,) = merged_rungs(g, np.ones(len(g), np.float32), [0.25])
+    ladder = assemble([whole(rung.gaussians), whole(g)])
+    made, label_of = in_cells(ladder, 6)
+    rows = by_label(made.gaussians)
+
+    def image(levels: dict[int, int]) -> torch.Tensor:
+        ends = {cell: (0, *made.sizes[cell]) for cell in levels}
+        kept = [rows[cell][ends[cell][k - 1] : ends[cell][k]] for cell, k in levels.items()]
+        return rasterize(made.gaussians.select(torch.from_numpy(np.concatenate(kept))), camera).rgb
+
+    low, full = (image(dict.fromkeys(label_of, level)) for level in (1, 2))
+    torch.testing.assert_close(low, rasterize(rung.gaussians, camera).rgb, atol=1e-5, rtol=0)
+    torch.testing.assert_close(full, rasterize(g, camera).rgb, atol=1e-5, rtol=0)
+    worst = float((low - full).square().mean())
+    errors = [
+        float((image({cell: 2 if cell < high else 1 for cell in label_of}) - full).square().mean())
+        for high in range(1, len(label_of))
+    ]
+    # where cells of other levels meet, what overlaps can cost a little more than one cell's upgrade brings
+    assert max(errors) < 1.05 * worst
+    assert errors[-1] < 0.5 * worst
