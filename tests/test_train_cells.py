@@ -1,6 +1,7 @@
 """Cells of categories: compact, of enough Gaussians, the same again; and ordered models split into them."""
 
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -80,6 +81,9 @@ def test_equal_places_and_small_categories_are_one_cell():
     cells, label_of = split_cells(np.zeros((50, 3), np.float32), np.repeat([1, 2], 25).astype(np.int16), 30)
     assert label_of == {0: 1, 1: 2}
     assert cells.tolist() == [0] * 25 + [1] * 25
+    few = np.repeat(np.eye(3, dtype=np.float32), 1000, 0)  # three places
+    cells, label_of = split_cells(few, np.zeros(3000, np.int16), 10)
+    assert cells.tolist() in [np.repeat(order, 1000).tolist() for order in permutations(range(3))]
     cells, label_of = split_cells(np.zeros((0, 3), np.float32), np.zeros(0, np.int16), 5)
     assert (len(cells), label_of) == (0, {})
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from scipy.cluster.vq import kmeans2
+from scipy.special import expit
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
@@ -78,7 +79,7 @@ def describe_cells(g: Gaussians, labels: dict[int, int]) -> Cells:
     """The cells of Gaussians whose label ids are cell ids; `labels`: the label id of each."""
     means, ids = g.means.numpy().astype(np.float64), np.array(sorted(labels))
     axes = np.sort(np.exp(g.log_scales.numpy().astype(np.float64)), 1)[:, 1:]
-    areas = axes.prod(1) / (1 + np.exp(-g.logit_opacities.numpy().astype(np.float64)))
+    areas = axes.prod(1) * expit(g.logit_opacities.numpy().astype(np.float64))
     rows = [np.flatnonzero(g.label_ids.numpy() == cell) for cell in ids]
     found = [_described(means[own], areas[own]) for own in rows]
     columns = [np.stack(column) for column in zip(*found, strict=True)]
@@ -95,7 +96,9 @@ def _described(
         some = rng.choice(len(means), _SAMPLE, p=areas / total)
         weight = np.full(_SAMPLE, total / _SAMPLE)
     points, nearest = means[some], np.arange(len(some))
-    if len(some) > POINTS:
+    if len(some) > POINTS:  # equal places are no two centres
+        points, nearest = np.unique(means[some], axis=0, return_inverse=True)
+    if len(points) > POINTS:
         points, nearest = kmeans2(means[some], POINTS, seed=0, minit="++", missing="warn")
     mine = np.bincount(nearest, weight, len(points))
     radius = np.quantile(np.linalg.norm(means[some] - points[nearest], axis=1), _AROUND)

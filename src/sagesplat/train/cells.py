@@ -56,7 +56,8 @@ def _nearest_centres(places: Float[np.ndarray, "n 3"], parts: int) -> Int[np.nda
     """The nearest of `parts` centres found by k-means; the same input gives the same."""
     if parts == 1:
         return np.zeros(len(places), np.int64)
-    some = np.linspace(0, len(places) - 1, min(len(places), _SAMPLE)).astype(int)
-    centres, _ = kmeans2(places[some], parts, seed=0, minit="++", missing="warn")
+    some = places[np.linspace(0, len(places) - 1, min(len(places), _SAMPLE)).astype(int)]
+    parts = min(parts, len(np.unique(some, axis=0)))  # equal places are no two centres
+    centres, _ = kmeans2(some, parts, seed=0, minit="++", missing="warn")
     squares = [((places - centre) ** 2).sum(1) for centre in centres]
     return np.argmin(squares, axis=0)
