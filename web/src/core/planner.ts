@@ -40,7 +40,8 @@ export interface Plan {
 
 const UNITS = ["bytes", "gpuBytes", "count"] as const;
 type Unit = (typeof UNITS)[number];
-const LEAST_SHARE = 1e-4; // least pixel share, so that every visible cell counts
+/** Least pixel share of a cell in sight: it may be there though it was hidden in all known views. */
+export const LEAST_SHARE = 1e-4;
 const SLACK = 0.01; // least gain of quality for which a budget's levels are left
 
 /** Costs of levels as sums over their increments, from the newest that replaces those below. */
@@ -56,8 +57,7 @@ export function ladderOf({ levels }: { readonly levels: readonly Level[] }): Lad
 }
 
 /** Weight of a cell at this viewpoint. */
-export const visibleWeight = (c: Candidate): number =>
-  c.visible ? c.weight * Math.max(c.share, LEAST_SHARE) : 0;
+export const visibleWeight = (c: Candidate): number => (c.visible ? c.weight * c.share : 0);
 
 /** The same, as if the cell were in sight. */
 export const potentialWeight = (c: Candidate): number => c.weight * Math.max(c.potential, LEAST_SHARE);

@@ -190,18 +190,10 @@ export class CellModel {
    * @param distance - the bundle's units, NaN: unknown
    */
   mean(distance: number): number[] {
-    const { sent, scale, views } = this;
     this.weights ??= this.solve();
+    const { sent, weights } = this;
     const n = this.own.length;
-    const log = distance > 0 && distance < Infinity ? Math.log(distance) : sent.medianLogDistance;
-    const near = new Float64Array(n);
-    for (let i = 0; i < n; i++) {
-      const view = this.own[i] as number;
-      const further = log - (this.logDistances[i] as number);
-      const seen = (views.rescaled[view] as number) * scale[2] + further * further * scale[3];
-      near[i] = matern(this.square(view) + seen);
-    }
-    const { weights } = this;
+    const near = this.near(distance).map(matern);
     const mean = sent.levels.map((_, level) => {
       let moved = 0;
       for (let i = 0, at = level * n; i < n; i++) moved += (near[i] as number) * (weights[at + i] as number);
@@ -209,6 +201,12 @@ export class CellModel {
       return (curve ? curveAt(curve, distance) : 0) + (sent.offsets[level] as number) + moved;
     });
     return spread(rising(mean), sent.levels, this.levels);
+  }
+
+  /** 1 at one of its own views, 0 far from all of them; by all four inputs. */
+  support(distance: number): number {
+    const least = this.near(distance).reduce((a, b) => Math.min(a, b), Infinity);
+    return least < Infinity ? matern(least) : 0;
   }
 
   /** A distance by points, corrected by their errors in the label's views nearby; NaN stays NaN. */
@@ -234,6 +232,20 @@ export class CellModel {
       total += alike[view] as number;
     }
     return sum / total;
+  }
+
+  /** Squares of the scaled differences to its views. */
+  private near(distance: number): Float64Array {
+    const { own, scale, sent, views, logDistances } = this;
+    const log = distance > 0 && distance < Infinity ? Math.log(distance) : sent.medianLogDistance;
+    const near = new Float64Array(own.length);
+    for (let i = 0; i < own.length; i++) {
+      const view = own[i] as number;
+      const further = log - (logDistances[i] as number);
+      const seen = (views.rescaled[view] as number) * scale[2] + further * further * scale[3];
+      near[i] = this.square(view) + seen;
+    }
+    return near;
   }
 
   /** Square of the scaled difference in place between the current viewpoint and a view. */
@@ -262,6 +274,7 @@ export class CellModel {
 /** The viewpoint models of a label's cells, and what the label keeps. */
 export class LabelModel {
   readonly cells: readonly CellModel[]; // as the label's, or one for all of them
+  readonly whole: CellModel | null; // that one
   private readonly targets: Float64Array;
   private readonly thresholds: Float64Array;
   private readonly slopes: Float64Array;
@@ -277,6 +290,7 @@ export class LabelModel {
       const levels = own.id < 0 ? levelsOf(label) : (label.cells[i]?.levels.length ?? 0);
       return new CellModel(levels, views, own, this.scale);
     });
+    this.whole = sent.cells.some(({ id }) => id < 0) ? (this.cells[0] ?? null) : null;
     this.targets = Float64Array.from(sent.targets, (target) => target * STEP);
     this.thresholds = Float64Array.from(sent.thresholds, (threshold) => threshold * STEP);
     this.slopes = Float64Array.from(sent.slopes, (slope) => slope * STEP);
@@ -294,16 +308,21 @@ export class LabelModel {
     );
   }
 
-  /** What the label keeps at the viewpoint that the views are seen from. */
-  outlook(): Outlook {
+  /**
+   * What the label keeps at the viewpoint that the views are seen from.
+   *
+   * @param distance - of a label with one model for all cells; NaN: unknown
+   */
+  outlook(distance = Number.NaN): Outlook {
     const { sent, targets } = this;
-    const support = this.support();
+    const support = this.whole?.support(distance) ?? this.support();
     const trust = support < sent.leastSupport ? "outside" : targets.length ? sent.status : "unknown";
     if (trust === "outside" || trust === "unknown") return { keeps: null, support, trust };
     const far = this.views.fromPhotos;
     return { keeps: { targets, needed: this.needed(Number.isNaN(far) ? 1 - support : far) }, support, trust };
   }
 
+  /** Of models of cells, by all shared views, whichever cells they show. */
   private support(): number {
     const { views, scale } = this;
     let least = Infinity;

@@ -2,7 +2,7 @@
 
 import type { Label, Promises, Quality, Settings, Viewpoint } from "../types";
 import { Points } from "./distance";
-import type { Candidate, Group } from "./planner";
+import { type Candidate, type Group, LEAST_SHARE } from "./planner";
 import {
   boundOf,
   LabelModel,
@@ -70,7 +70,11 @@ export class ViewpointModels {
       for (const { share } of family.entries) total += share;
     }
     const whole = Math.max(1, total);
-    for (const { entries } of families) for (const entry of entries) entry.share /= whole;
+    for (const { entries } of families) {
+      for (const entry of entries) {
+        entry.share = entry.sight.visible ? Math.max(entry.share / whole, LEAST_SHARE) : 0;
+      }
+    }
   }
 
   private predict(family: Family): void {
@@ -79,12 +83,10 @@ export class ViewpointModels {
     const isSeen = entries.some(({ sight }) => sight.visible);
     // plans do not depend on what is out of sight; skipping it keeps large scenes fast
     const known = label.quality[this.quality];
-    family.outlook = model && isSeen ? model.outlook() : outlookAnywhere(known);
-    const [whole] = model?.cells ?? [];
-    const together = this.isByLabel && isSeen && whole;
-    const means = together
-      ? together.mean(together.corrected(Points.together(entries.map(({ points }) => points))))
-      : meansAnywhere(known, levelsOf(label));
+    const whole = isSeen ? model?.whole : null;
+    const distance = whole?.corrected(Points.together(entries.map(({ points }) => points)));
+    family.outlook = model && isSeen ? model.outlook(distance) : outlookAnywhere(known);
+    const means = whole?.mean(distance ?? Number.NaN) ?? meansAnywhere(known, levelsOf(label));
     for (const [i, entry] of entries.entries()) {
       const own = this.isByLabel || !entry.sight.visible ? undefined : model?.cells[i];
       entry.mean = own?.mean(entry.sight.distance) ?? means.slice(0, entry.cell.levels.length);

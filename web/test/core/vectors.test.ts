@@ -1,10 +1,12 @@
 /** How viewpoints see cells, and promises: by hand, and against those of the Python package. */
 
 import { describe, expect, test } from "vitest";
+import distances from "../../../tests/data/distances.json?raw";
 import promised from "../../../tests/data/promises.json?raw";
 import { Points } from "../../src/core/distance";
 import {
   boundOf,
+  type CellModel,
   curveAt,
   LabelModel,
   meansAnywhere,
@@ -14,35 +16,73 @@ import {
 } from "../../src/core/quality";
 import { entriesOf } from "../../src/core/residency";
 import { familiesOf, ViewpointModels } from "../../src/core/viewpoints";
-import type { Cell, CellPromises, Curve, Label, Promises, Viewpoint } from "../../src/types";
+import type { Cell, CellPromises, Curve, Label, LabelPromises, Promises, Viewpoint } from "../../src/types";
 import { Network, VirtualClock } from "../simulate";
 import { at, bundle, differences, frustumOf, modelsOf } from "../worlds";
 
-/** Numbers of one viewpoint; null: NaN. */
-interface Seen {
-  readonly viewpoint: Omit<Viewpoint, "focal"> & { readonly focal: number | null };
-  readonly cells: { readonly id: number; readonly share: number; readonly mean: (number | null)[] }[];
-  readonly labels: {
-    readonly id: number;
-    readonly support: number;
-    readonly bound: number | null; // of the composition
-    readonly levels: number[]; // of it, from 1, by cell
-  }[];
-  readonly away: number | null; // from the photos
-}
-interface PromiseCase {
+/** Null: NaN, or of a focal length, the photos'. */
+type Maybe = number | null;
+type Place = Omit<Cell, "levels">;
+type Pose = Pick<Viewpoint, "position" | "direction">;
+
+interface DistanceCase {
   readonly name: string;
-  readonly cells?: (Cell & { readonly label: number })[];
+  readonly cells: readonly Place[];
+  readonly camera: Viewpoint;
+  readonly expected: {
+    readonly visible: readonly boolean[];
+    readonly distance: readonly Maybe[];
+    readonly apparent: readonly number[];
+    readonly whole: Maybe; // of all cells as one label
+  };
+}
+interface SsimView extends Pose {
+  readonly focal: Maybe;
+  readonly distance: Maybe;
+  readonly corrected: Maybe;
+  readonly mean: readonly number[]; // by level of the model
+  readonly bound: readonly Maybe[];
+  readonly support: number;
+}
+interface FidelityView extends Viewpoint {
+  readonly focal: number;
+  readonly levels: readonly number[]; // of a composition, from 1, by cell
+  readonly expected: {
+    readonly share: readonly number[]; // by cell
+    readonly means: readonly (readonly number[] | null)[]; // by cell in sight and level
+    readonly away: number; // from the photos
+    readonly support: readonly number[]; // by label
+    readonly mean: readonly Maybe[]; // of the composition
+    readonly bound: readonly Maybe[];
+  };
+}
+interface FidelityCase {
+  readonly name: string;
+  readonly labels: readonly { readonly id: number; readonly cells: (Place & { numLevels: number })[] }[];
   readonly promises: Promises;
-  readonly viewpoints: Seen[];
+  readonly viewpoints: readonly FidelityView[];
+}
+interface SsimCase extends Pick<FidelityCase, "name" | "promises"> {
+  readonly viewpoints: readonly SsimView[];
 }
 
-function near(found: number, expected: number | null, what: string): void {
+const EXACT = 1e-9;
+const SINGLE = 1e-5; // cameras of the Python package have single precision
+
+function near(found: number, expected: Maybe, what: string, tolerance: number): void {
   if (expected === null) expect(found, what).toBeNaN();
-  else expect(Math.abs(found - expected), what).toBeLessThanOrEqual(1e-9 * Math.max(1, Math.abs(expected)));
+  else {
+    const most = tolerance * Math.max(1e-3, Math.abs(expected));
+    expect(Math.abs(found - expected), `${what}: ${found}, not ${expected}`).toBeLessThanOrEqual(most);
+  }
 }
 
 const level = { uri: "a.spz", format: "spz", bytes: 1, gpuBytes: 1, count: 1, sha256: "" } as const;
+const levelled = (place: Place, count: number): Cell => ({
+  ...place,
+  levels: Array.from({ length: count }, () => level),
+});
+const somewhere: Place = { id: 0, bounds: [0, 0, 0, 1, 1, 1], points: [0, 0, 0, 1], area: 1, radius: 1 };
 const labelOf = (id: number, cells: readonly Cell[]): Label => ({
   id,
   name: "label",
@@ -54,37 +94,80 @@ const labelOf = (id: number, cells: readonly Cell[]): Label => ({
   quality: {},
 });
 
-const cases = (JSON.parse(promised) as { cases: PromiseCase[] }).cases.filter(({ cells }) => cells);
-test.skipIf(!cases.length)("promises are those of the Python package", () => {
-  for (const { name, cells = [], promises, viewpoints } of cases) {
-    const ids = [...new Set(cells.map(({ label }) => label))];
-    const labels = ids.map((id) =>
-      labelOf(
-        id,
-        cells.filter(({ label }) => label === id),
-      ),
-    );
-    const families = familiesOf(entriesOf(labels));
-    const models = new ViewpointModels(promises.quality, labels, promises);
-    for (const { viewpoint, cells: seen, labels: expected } of viewpoints) {
-      const { focal, ...from } = viewpoint;
-      models.see(families, { ...from, ...(focal !== null && { focal }) });
-      for (const family of families) {
-        const told = expected.find(({ id }) => id === family.label.id);
-        let [sum, total] = [0, 0];
-        for (const [i, entry] of family.entries.entries()) {
-          const own = seen.find(({ id }) => id === entry.cell.id);
-          near(entry.share, own?.share ?? 0, `${name}: share`);
-          const means = entry.sight.visible ? (own?.mean ?? []) : [];
-          for (const [k, mean] of means.entries()) near(entry.mean[k] ?? 0, mean, `${name}: mean`);
-          if (entry.share > 0) sum += entry.share * (entry.mean[(told?.levels[i] ?? 0) - 1] ?? Number.NaN);
-          total += entry.share;
-        }
-        if (!told || !family.entries.some(({ sight }) => sight.visible)) continue;
-        near(family.outlook.support, told.support, `${name}: support`);
-        const { keeps } = family.outlook;
-        near(keeps ? boundOf(keeps, sum / total) : Number.NaN, told.bound, `${name}: bound`);
+const distanceCases = (JSON.parse(distances) as { cases: DistanceCase[] }).cases;
+test.each(distanceCases)("distances are those of the Python package: $name", (one) => {
+  const { cells, camera, expected } = one;
+  const points = cells.map((place) => new Points(levelled(place, 1)));
+  for (const [i, { visible, distance, apparent }] of points.map((each) => each.look(camera)).entries()) {
+    expect(visible).toBe(expected.visible[i]);
+    near(distance, expected.distance[i] as Maybe, "distance", SINGLE);
+    near(apparent, expected.apparent[i] as number, "apparent", SINGLE);
+  }
+  near(Points.together(points), expected.whole, "of all", SINGLE);
+});
+
+const promiseCases = (JSON.parse(promised) as { cases: (SsimCase | FidelityCase)[] }).cases;
+const isOfCells = (one: SsimCase | FidelityCase): one is FidelityCase => one.promises.quality === "fidelity";
+
+test.each(promiseCases.filter((one): one is SsimCase => !isOfCells(one)))(
+  "ssim is that of the Python package: $name",
+  (one) => {
+    const { promises, viewpoints } = one;
+    const [own] = promises.labels as readonly [LabelPromises];
+    const known = own.cells[0]?.levels ?? [];
+    const views = new Views(promises);
+    const model = new LabelModel(labelOf(own.id, [levelled(somewhere, Math.max(...known))]), views, own);
+    const { whole } = model as { whole: CellModel };
+    for (const { position, direction, focal, ...expected } of viewpoints) {
+      const distance = expected.distance ?? Number.NaN;
+      views.from({ position, direction, ...(focal !== null && { focal }) });
+      near(whole.corrected(distance), expected.corrected, "corrected", EXACT);
+      const { support, keeps } = model.outlook(distance);
+      near(support, expected.support, "support", EXACT);
+      const mean = whole.mean(distance);
+      expect(mean.filter((value) => !Number.isNaN(value))).toHaveLength(known.length);
+      for (const [k, of] of known.entries()) {
+        const found = mean[of - 1] as number;
+        near(found, expected.mean[k] as number, "mean", EXACT);
+        near(keeps ? boundOf(keeps, found) : Number.NaN, expected.bound[k] as Maybe, "bound", EXACT);
       }
+    }
+  },
+);
+
+test.each(promiseCases.filter(isOfCells))("fidelity is that of the Python package: $name", (one) => {
+  const { promises, viewpoints } = one;
+  const labels = one.labels.map(({ id, cells }) =>
+    labelOf(
+      id,
+      cells.map(({ numLevels, ...place }) => levelled(place, numLevels)),
+    ),
+  );
+  const families = familiesOf(entriesOf(labels));
+  const models = new ViewpointModels(promises.quality, labels, promises);
+  const views = new Views(promises);
+  for (const { levels, expected, ...viewpoint } of viewpoints) {
+    models.see(families, viewpoint);
+    views.from(viewpoint);
+    near(views.fromPhotos, expected.away, "away", SINGLE);
+    for (const [i, { entries, outlook }] of families.entries()) {
+      let [sum, total] = [0, 0];
+      for (const { cell, mean, share, sight } of entries) {
+        near(share, expected.share[cell.id] as number, "share", SINGLE);
+        const means = expected.means[cell.id] as readonly number[] | null;
+        expect(sight.visible).toBe(means !== null);
+        if (!means) continue;
+        expect(mean).toHaveLength(means.length);
+        for (const [k, value] of means.entries()) near(mean[k] as number, value, "mean", SINGLE);
+        sum += share * (mean[(levels[cell.id] as number) - 1] as number);
+        total += share;
+      }
+      near(sum / total, expected.mean[i] as Maybe, "of the composition", SINGLE);
+      if (!total) continue;
+      near(outlook.support, expected.support[i] as number, "support", SINGLE);
+      const { keeps } = outlook;
+      const bound = keeps ? boundOf(keeps, sum / total) : Number.NaN;
+      near(bound, expected.bound[i] as Maybe, "bound", SINGLE);
     }
   }
 });
