@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_run_executor import Shuffled
 
-from sagesplat.adapt.ladder import PrefixLadder, read_ladder, read_prefixes
+from sagesplat.adapt.ladder import read_ladder, read_prefixes
 from sagesplat.core.config import (
     BlocksConfig,
     FitConfig,
@@ -370,8 +370,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     few = replace(CONFIG.nest, steps=4, levels=2, base_share=0.0)
     nest_scene(job_of(path, force=True), few, 0)
     job = job_of(path)
-    names, ladder = job.names(), job.ladder
-    assert isinstance(ladder, PrefixLadder)
+    names, ladder = job.names(), job.by_cell
     found = {split_name(names[label]) for label in ladder.sizes}
     assert {("potted plant 1", 0), ("dining table", 0), ("dining table", 1)} <= found
     assert {block for name, block in found if name in job.parents} == {0, 1}
@@ -396,9 +395,10 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
         "potted plant 1@0", "potted plant 1@1",
     ]  # fmt: skip
     assert {job.parents_by_id.get(i) for i in plants} == {None, "potted plant@0", "potted plant@1"}
-    # the viewer's tree: category, instance, block
-    tree = {(c.parent, c.category, c.block) for c in bundle_contents(job, ladder.gaussians, False).categories}
-    assert {("potted plant", "potted plant 1", 0), (None, "dining table", 1)} <= tree
+    # the viewer's tree: category, instance
+    contents = bundle_contents(job, ladder.gaussians, job.cells, False)
+    tree = {(c.parent, c.name) for c in contents.categories}
+    assert {("potted plant", "potted plant 1@0"), (None, "dining table@1")} <= tree
     # snapshots have no instances, and they can be folded back
     assert Job(RunDir(path, "snapshots"), print).names() == before
     assert live_bundle(job_of(path), tmp_path / "live", a_viewer(tmp_path))
@@ -417,7 +417,7 @@ def test_categories_of_blocks_can_be_hidden(finished: Path, tmp_path: Path) -> N
     made = apply_labels(job, tmp_path / "labels.edit.json", tmp_path / "out", viewer=a_viewer(tmp_path))
     labels = {one["name"]: one for one in read_json(made.bundle.path / "manifest.json")["labels"]}
     assert labels["dining table@0"]["hidden"]
-    assert (labels["dining table@1"]["block"], labels["dining table@1"].get("hidden")) == (1, None)
+    assert "hidden" not in labels["dining table@1"]
     assert job_of(made.path).names() == job.names()
 
 

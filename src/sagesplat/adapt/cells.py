@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from scipy.cluster.vq import kmeans2
 from scipy.special import expit
 
 from sagesplat.core.errors import DataError, short
@@ -27,6 +26,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.scene.scene import Camera
+from sagesplat.train.cells import k_means
 
 POINTS = 16  # of a cell
 STEPS = 255  # of positions within the bounds, and of areas
@@ -93,13 +93,13 @@ def _described(
     rng, total = np.random.default_rng(0), max(areas.sum(dtype=float), 1e-300)
     some, weight = np.arange(len(means)), areas
     if len(means) > _SAMPLE:
-        some = rng.choice(len(means), _SAMPLE, p=areas / total)
+        some = rng.choice(len(means), _SAMPLE, p=areas / total if areas.any() else None)
         weight = np.full(_SAMPLE, total / _SAMPLE)
     points, nearest = means[some], np.arange(len(some))
     if len(some) > POINTS:  # equal places are no two centres
         points, nearest = np.unique(means[some], axis=0, return_inverse=True)
     if len(points) > POINTS:
-        points, nearest = kmeans2(means[some], POINTS, seed=0, minit="++", missing="warn")
+        points, nearest = k_means(means[some], POINTS)
     mine = np.bincount(nearest, weight, len(points))
     radius = np.quantile(np.linalg.norm(means[some] - points[nearest], axis=1), _AROUND)
     kept = points[mine > 0] if (mine > 0).any() else points

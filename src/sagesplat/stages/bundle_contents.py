@@ -33,11 +33,11 @@ def bundle_contents(job: Job, g: Gaussians, cells: Cells, antialiased: bool) -> 
             Category(
                 i,
                 names[i],
-                _title(job, category),
+                _title(job, category) + ("" if block is None else f" (block {block})"),
                 colors[category],
                 parent=parents.get(category),
             )
-            for i, (category, _) in split_names.items()
+            for i, (category, block) in split_names.items()
         ],
         cells=cells,
         chunks=[],

@@ -4,6 +4,8 @@ Categories are split by place. Far things are split by direction: coordinates be
 contracted into a ball of twice its radius (Mip-NeRF 360, Eq. 10).
 """
 
+import warnings
+
 import numpy as np
 from jaxtyping import Float, Int, Int16
 from scipy.cluster.vq import kmeans2
@@ -41,6 +43,16 @@ def split_cells(
     return cells, label_of
 
 
+def k_means(
+    places: Float[np.ndarray, "n 3"], parts: int
+) -> tuple[Float[np.ndarray, "p 3"], Int[np.ndarray, " n"]]:
+    """Centres, some of which may be nearest to none of the places, and the nearest one to each place."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of such centres
+        centres, nearest = kmeans2(places, parts, seed=0, minit="++", missing="warn")
+    return centres, nearest
+
+
 def contracted(means: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     """Positions around the scene's middle, in a ball of radius 2."""
     if not len(means):
@@ -58,6 +70,6 @@ def _nearest_centres(places: Float[np.ndarray, "n 3"], parts: int) -> Int[np.nda
         return np.zeros(len(places), np.int64)
     some = places[np.linspace(0, len(places) - 1, min(len(places), _SAMPLE)).astype(int)]
     parts = min(parts, len(np.unique(some, axis=0)))  # equal places are no two centres
-    centres, _ = kmeans2(some, parts, seed=0, minit="++", missing="warn")
+    centres, _ = k_means(some, parts)
     squares = [((places - centre) ** 2).sum(1) for centre in centres]
     return np.argmin(squares, axis=0)
