@@ -84,7 +84,8 @@ class Bundling(types.ModuleType):
             for c in json.loads((job.run.increments / "index.json").read_text())["chunks"]
         ]
         manifest = {
-            "format": "sagesplat-bundle", "live": False, "labels": [{"levels": levels}], "ladder": "aa",
+            "format": "sagesplat-bundle", "live": False, "labels": [{"cells": [{"levels": levels}]}],
+            "ladder": "aa",
         }  # fmt: skip
         page = self.viewer["index.html"].replace(
             b"<!-- poster -->", b'<img id="poster" src="poster.jpg" alt="" />'

@@ -17,10 +17,13 @@ import numpy as np
 import pytest
 import torch
 from browser import Opened, open_page
-from make_viewer_vectors import model
+from make_viewer_vectors import SCREENS, calibration, model
 from page_checks import wrong_with, wrong_with_keyboard
 
-from sagesplat.adapt.viewpoint import QualityKind, ViewModel
+from sagesplat.adapt.cell_models import CellModel, FidelityModel
+from sagesplat.adapt.cells import describe_cells
+from sagesplat.adapt.process import inputs_of
+from sagesplat.adapt.viewpoint import Calibration, QualityKind, ViewModel, where
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.second_opacity import SecondOpacities, blended
 from sagesplat.formats.increments import Increment, full_scene, read_increments, shown, write_increments
@@ -46,9 +49,11 @@ POLICY = (
 NAMES = {1: "brick", 2: "grass-merged", 3: "sky-other-merged"}
 COLOURS = {1: (0.8, 0.2, 0.1), 2: (0.1, 0.7, 0.2), 3: (0.15, 0.25, 0.85)}
 SIZES = dict.fromkeys(COLOURS, (20, 50, 100, 200))  # splats up to each level
+LABEL_OF = dict(zip(COLOURS, COLOURS, strict=True))  # of the cells
 WHOLE = sum(size[-1] for size in SIZES.values())
 BASE = sum(size[0] for size in SIZES.values())
 
+CELLS = "sagesplat.state().labels.flatMap((l) => l.cells)"
 # the canvas, read in the task that drew it, once all is sorted
 PIXELS = """() => new Promise((resolve) => {
   const stop = sagesplat.onSample(({ settled }) => {
@@ -123,21 +128,19 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bundle"
 
 
-def three_walls(folder: Path, **increments: Any) -> Contents:
+def three_walls(folder: Path, label_of: Mapping[int, int] = LABEL_OF, **increments: Any) -> Contents:
+    """Each wall is a cell; `label_of`: the category of each."""
     g = cloud()
-    chunks = write_increments(
-        folder / "chunks", g, SIZES, NAMES, label_of=dict(zip(SIZES, SIZES, strict=True)), **increments
-    )
-    places = {i: g.means[g.label_ids == i].numpy() * [1, -1, -1] for i in NAMES}
+    chunks = write_increments(folder / "chunks", g, SIZES, NAMES, label_of=label_of, **increments)
     categories = [
-        Category(i, name, name.split("-")[0], "#" + bytes(int(255 * c) for c in COLOURS[i]).hex(),
-                 np.concatenate([places[i].min(0), places[i].max(0)])[None])
+        Category(i, name, name.split("-")[0], "#" + bytes(int(255 * c) for c in COLOURS[i]).hex())
         for i, name in NAMES.items()
-    ]  # fmt: skip
+    ]
     entries = [CameraEntry(f"photo{k}.jpg", "train", camera(0.2 * k)) for k in range(3)]
     return Contents(
-        "three walls", 1.0, entries, categories, chunks, folder / "chunks", 3, meters_per_unit=1.0
-    )
+        "three walls", 1.0, entries, categories, describe_cells(g, dict(label_of)), chunks,
+        folder / "chunks", 3, meters_per_unit=1.0,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -145,26 +148,36 @@ def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle whose categories have models of both qualities; one is not calibrated."""
     folder = tmp_path_factory.mktemp("promised")
     contents = three_walls(folder)
-    cameras = contents.viewpoints("ssim")
+    cameras = [entry.camera for entry in contents.cameras]
+    position, direction, screen = where(cameras, camera().focal)
+    views = inputs_of(np.full(len(cameras), 5.0), position, direction, 1.0, 0.0, screen)
     seen = Seen(np.full(len(cameras), 0.3), np.full(len(cameras), 5.0))
 
-    def models(label: int) -> dict[QualityKind, ViewModel]:
-        inputs = np.array(
-            [[*camera.position, *camera.direction, 0.0, np.log(5)] for camera in cameras], np.float64
-        )
-        found: dict[QualityKind, ViewModel] = {}
-        for quality in ("fidelity", "ssim"):
-            made = model(label, len(cameras), [1, 2, 3, 4], quality=quality, unseen=False)
-            status = "uncalibrated" if label == 2 else "calibrated"
-            found[quality] = replace(
-                made, label_id=label, inputs=inputs, extent=1.0, focal=camera().focal, lengths=(2.0,) * 4,
-                weights=made.weights * 0,
-                calibration=replace(made.calibration, status=status, slopes=made.calibration.slopes * 0),
-            )  # fmt: skip
-        return found
+    def usual(label: int, quality: QualityKind) -> Calibration:
+        known = calibration(quality)
+        status = "uncalibrated" if label == 2 else "calibrated"
+        return replace(known, status=status, slopes=known.slopes * 0)
+
+    def ssim(label: int) -> ViewModel:
+        made = model(label, len(cameras), [1, 2, 3, 4], unseen=False)
+        return replace(
+            made, label_id=label, inputs=views, extent=1.0, focal=camera().focal, lengths=(2.0,) * 4,
+            weights=made.weights * 0, calibration=usual(label, "ssim"),
+        )  # fmt: skip
+
+    def fidelity(label: int) -> FidelityModel:
+        nothing = np.zeros(0)
+        cell = CellModel(
+            label, np.array([0.6, 0.73, 0.87, 1.0]), nothing.astype(int), nothing, np.log(5.0),
+            np.zeros((4, 0)), np.full(len(views), -1.0),
+        )  # fmt: skip
+        return FidelityModel(
+            label, 1.0, camera().focal, SCREENS, views[:, :7], (2.0,) * 4, views[:, :6].T, (cell,), 0.0,
+            usual(label, "fidelity"),
+        )  # fmt: skip
 
     categories = [
-        replace(c, models=models(c.label_id), seen={"fidelity": seen, "ssim": seen})
+        replace(c, fidelity=fidelity(c.label_id), ssim=ssim(c.label_id), seen=seen)
         for c in contents.categories
     ]
     write_bundle(folder / "bundle", replace(contents, categories=categories, drawn=cameras), package_viewer())
@@ -282,7 +295,7 @@ def test_the_picture_is_the_rasterizers(viewer: Opened, made: Path) -> None:
     listed = [
         Increment(
             label["id"],
-            label["id"],
+            cell["id"],
             k,
             Path(e["uri"]).name,
             e["count"],
@@ -291,7 +304,8 @@ def test_the_picture_is_the_rasterizers(viewer: Opened, made: Path) -> None:
             e["sha256"],
         )
         for label in labels
-        for k, e in enumerate(label["levels"], 1)
+        for cell in label["cells"]
+        for k, e in enumerate(cell["levels"], 1)
     ]
     assert psnr_to(shown, read_increments(made / "chunks", listed)) > 30
 
@@ -318,9 +332,7 @@ def test_streams_are_drawn_as_the_rasterizer_draws_each_of_their_levels(browser,
     """Also with two opacities, on the way up and down: what is drawn depends on the newest level."""
     g = cloud()
     second = SecondOpacities(g.logit_opacities - 3, dict.fromkeys(NAMES, (0.0, 0.0, 0.4, 1.0)))
-    streams = write_streams(
-        tmp_path / "streams", g, SIZES, NAMES, label_of=dict(zip(SIZES, SIZES, strict=True)), second=second
-    )
+    streams = write_streams(tmp_path / "streams", g, SIZES, NAMES, label_of=LABEL_OF, second=second)
     contents = replace(three_walls(tmp_path), chunks=streams.increments, folder=tmp_path / "streams")
     ladder, kept = read_streams(contents.folder, contents.chunks)
     assert kept is not None
@@ -352,9 +364,9 @@ def drawn_within_budgets(
         for count in counts:
             budget = f"{{ bytes: Infinity, gpuBytes: Infinity, count: {count} }}"
             opened.page.evaluate(f"sagesplat.set({{ mode: 'budget', budget: {budget} }})")
-            opened.wait_for("sagesplat.state().labels.every((l) => l.shown === l.wanted)")
+            opened.wait_for(f"{CELLS}.every((c) => c.shown === c.wanted)")
             picture = settled(opened)
-            levels = dict(opened.page.evaluate("sagesplat.state().labels.map((l) => [l.label.id, l.shown])"))
+            levels = dict(opened.page.evaluate(f"{CELLS}.map((c) => [c.cell.id, c.shown])"))
             g = held(levels)
             assert opened.page.evaluate("sagesplat.state().count") == len(g) <= count
             assert psnr_to(picture, g) > 30
@@ -480,10 +492,10 @@ def test_the_first_minute(promised: str, browser: Any, size: tuple[int, int], sc
 
 
 def promises(opened: Opened) -> list[list[Any]]:
-    opened.wait_for(
-        "sagesplat.state().pending === 0 && sagesplat.state().labels.every((l) => l.shown >= l.wanted)"
+    opened.wait_for(f"sagesplat.state().pending === 0 && {CELLS}.every((c) => c.shown >= c.wanted)")
+    return opened.page.evaluate(
+        "sagesplat.state().labels.map((l) => [l.cells[0].shown, l.promised, l.trust])"
     )
-    return opened.page.evaluate("sagesplat.state().labels.map((l) => [l.shown, l.promised, l.trust])")
 
 
 @pytest.mark.slow
@@ -537,7 +549,7 @@ def test_promises_are_for_screens_and_a_window_that_changes_is_another(promised:
 def test_nothing_is_promised_while_a_category_in_sight_is_missing(
     promised_bundle: Path, browser: Any
 ) -> None:
-    brick = json.loads((promised_bundle / "manifest.json").read_text())["labels"][0]["levels"][0]
+    brick = json.loads((promised_bundle / "manifest.json").read_text())["labels"][0]["cells"][0]["levels"][0]
     with (
         serve(promised_bundle, {brick["uri"]: None, ".pack": None}) as url,
         open_page(url, (900, 640), browser=browser) as opened,
@@ -626,7 +638,7 @@ def test_a_headset_session(site: str, browser: Any) -> None:
 
 @pytest.mark.parametrize("missing", [False, True])
 def test_a_broken_chunk_is_named_and_the_rest_lives_on(made: Path, browser: Any, missing: bool) -> None:
-    brick = json.loads((made / "manifest.json").read_text())["labels"][0]["levels"][1]
+    brick = json.loads((made / "manifest.json").read_text())["labels"][0]["cells"][0]["levels"][1]
     other = None if missing else b"\0" * brick["bytes"]
     with serve(made, {brick["uri"]: other, ".pack": None}) as url, open_page(url, browser=browser) as opened:
         ready(opened)
@@ -668,36 +680,31 @@ def test_a_lost_context_is_said(site: str, browser: Any) -> None:
         assert "GPU context was lost" in message(opened)
 
 
-# a scene in blocks
+# cells
 
 
 @pytest.mark.slow
-def test_parts_are_listed_weighed_and_hidden_by_category(made: Path, tmp_path: Path, browser: Any) -> None:
-    """The outer two walls are one category in two blocks."""
-    out = Path(shutil.copytree(made, tmp_path / "bundle"))
-    manifest = json.loads((out / "manifest.json").read_text())
-    parts = (("brick", 0), ("grass", 0), ("brick", 1))
-    for label, (category, block) in zip(manifest["labels"], parts, strict=True):
-        label |= {"name": f"{category}@{block}", "category": category, "block": block, "title": category}
-    (out / "manifest.json").write_text(json.dumps(manifest))
-    with serve(out) as url, open_page(url, (900, 640), browser=browser) as opened:
+def test_cells_are_one_category_and_can_be_told_apart_by_their_colours(tmp_path: Path, browser: Any) -> None:
+    """The outer two walls are cells of one category."""
+    contents = three_walls(tmp_path, {1: 1, 2: 2, 3: 1})
+    write_bundle(tmp_path / "bundle", contents, package_viewer())
+    with serve(tmp_path / "bundle") as url, open_page(url, (900, 640), browser=browser) as opened:
         page = opened.page
         ready(opened, WHOLE)
         assert page.locator(".labels > li").count() == 2
         bricks = page.locator(".labels > li", has_text="brick")
-        assert "2 blocks" in bricks.inner_text()
-        bricks.locator(".blocks").click()
-        assert bricks.locator(".parts .name").all_inner_texts() == ["block 0", "block 1"]
         bricks.get_by_label("Weight of brick").select_option("4")
-        weights = page.evaluate("[...sagesplat.settings().weights.values()]")
-        assert weights == [4, 1, 4]
+        assert page.evaluate("[...sagesplat.settings().weights]") == [[1, 4]]
         before = settled(opened)
         page.keyboard.press("t")
+        assert opened.wait_for("document.querySelector('.status').textContent") == "Coloured by category"
+        by_category = settled(opened)
+        assert np.abs(by_category - before).max() > 0.2
         page.keyboard.press("t")
-        assert opened.wait_for("document.querySelector('.status').textContent") == "Coloured by block"
-        assert np.abs(settled(opened) - before).max() > 0.2
+        opened.wait_for("document.querySelector('.status').textContent === 'Coloured by cell'")
+        assert np.abs(settled(opened) - by_category).max() > 0.2
         bricks.get_by_label("Hide brick").click()
-        assert bricks.get_by_label("Show brick").count() == 1
+        opened.wait_for("document.querySelector('[aria-label=\"Show brick\"]')")
         assert opened.complaints == []
 
 

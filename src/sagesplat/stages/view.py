@@ -168,8 +168,13 @@ class _Chunk:
 
 
 @dataclass(frozen=True)
-class _Levels:
+class _Cell:
     levels: list[_Chunk]
+
+
+@dataclass(frozen=True)
+class _Label:
+    cells: list[_Cell]
 
 
 @dataclass(frozen=True)
@@ -177,7 +182,7 @@ class _Shown:
     """Of a manifest what says of which levels it is."""
 
     ladder: str
-    labels: list[_Levels]
+    labels: list[_Label]
 
 
 @dataclass(frozen=True)
@@ -195,7 +200,7 @@ def _is_current(run: RunDir, folder: Path) -> bool:
     listed = known_json(run.increments / INDEX, _Chunks)
     if manifest is None or listed is None:  # `bundle` says what is wrong with the run
         return False
-    held = {level.sha256 for label in manifest.labels for level in label.levels}
+    held = {level.sha256 for label in manifest.labels for cell in label.cells for level in cell.levels}
     chunks = {chunk.sha256 for chunk in listed.chunks}
     made = (folder / MANIFEST).stat().st_mtime
     newer = (path for path in (run.fidelity, run.promises, run.plan) if path.exists())

@@ -293,8 +293,9 @@ def _manifest(folder: Path, size: int) -> list[bytes]:
     )
     put(folder / "run/nested/promises.json", b"{}")
     levels = [{"uri": "chunks/2-1.spz", "sha256": "0" * 64, "nbytes": 9}]
-    labels = [{"id": 2 + i, "name": "sky", "levels": levels} for i in range(size)]
-    return as_json({"format": "sagesplat-bundle", "version": 1, "labels": labels})
+    cells = [{"id": i, "levels": levels} for i in range(size)]
+    labels = [{"id": 2 + i, "name": "sky", "cells": cells[i : i + 2]} for i in range(size)]
+    return as_json({"format": "sagesplat-bundle", "version": 1, "ladder": "aa", "labels": labels})
 
 
 def _read_manifest(path: Path) -> None:
