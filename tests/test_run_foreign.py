@@ -265,7 +265,7 @@ def test_any_document_and_command(
         ("compose", "nested/plan.json", '"label_id": 3', '"label_id": 4', "of category 4 is not this run's"),
         ("plan", "nested/promises.json", '"label_id": 3', '"label_id": 4', "category 4 is not this run's"),
         ("plan", "nested/increments/index.json", '"level": 4', '"level": 5', "level 5 is not this run's"),
-        ("bundle", "nested/increments/index.json", '"count": 1', '"count": 2', "Gaussians of category"),
+        ("bundle", "nested/increments/index.json", '"count": 1', '"count": 2', "Gaussians of cell"),
         ("compose", "masks/labels.json", '"3"', '"5"', r"of category 3, which .*labels\.json does not name"),
     ],
 )

@@ -131,7 +131,12 @@ def test_it_bundles(adopted: Path, tmp_path: Path) -> None:
     parents = {one["name"]: one.get("parent") for one in manifest["labels"]}
     assert {name: of for name, of in parents.items() if of} == {"car 1": "car"}
     assert "car" in parents
-    refine = [level.get("refine") for label in manifest["labels"] for level in label["levels"]]
+    refine = [
+        level.get("refine")
+        for label in manifest["labels"]
+        for cell in label["cells"]
+        for level in cell["levels"]
+    ]
     assert "REPLACE" in refine
     with Image.open(adopted / "viewpoints.png") as sheet:
         assert sheet.width > 500

@@ -127,7 +127,10 @@ class Expected:
 def expect(
     models: Mapping[int, FidelityModel], cells: Cells, cameras: Sequence[Camera], levels: int
 ) -> Expected:
-    """What V cameras are expected to see of the cells, at each of `levels` levels."""
+    """What V cameras are expected to see of the cells, at each of `levels` levels.
+
+    Models of fewer levels have their last one from there on.
+    """
     labels, column = np.unique(cells.labels, return_inverse=True)
     sight = look(cells, cameras)
     shape = len(cameras), len(cells.ids)
@@ -141,7 +144,8 @@ def expect(
         near = matern32(known[:, :6], model.views[:, :6], PHOTO_LENGTHS)
         for cell in model.cells:
             i = place[cell.cell]
-            mean[:, i] = cell_means(model, cell, known, sight.distance[:, i])
+            of_levels = cell_means(model, cell, known, sight.distance[:, i])
+            mean[:, i] = of_levels[:, np.minimum(np.arange(levels), of_levels.shape[1] - 1)]
             factor[:, i] = visible_factor(near, cell.factors)
     share = sight.apparent * factor
     share /= np.maximum(share.sum(1, keepdims=True), 1)

@@ -59,4 +59,4 @@ def compose_inputs(job: Job) -> list[Path]:
     """What a plan's composition is made from."""
     run = job.run
     made = [run.provenance("plan"), run.provenance("train"), *label_image_inputs(run)]
-    return [*run.scene_files, run.plan, method_of(job).level_files[0], *made]
+    return [*run.scene_files, run.plan, *method_of(job).level_files[:2], *made]

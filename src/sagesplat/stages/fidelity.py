@@ -102,7 +102,7 @@ class Compositions:
             if not self._pixels.size:  # the first time all are new
                 self._pixels = pixels
         found = [[known[one] for one in some] for known, some in zip(self._known, wanted, strict=True)]
-        return np.array(found, np.float32), self._pixels
+        return np.array(found, np.float32) if found else np.zeros((*planned.shape[:2], 0)), self._pixels
 
 
 def compositions_at(

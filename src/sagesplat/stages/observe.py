@@ -34,8 +34,8 @@ def observe_levels(job: Job, config: FitConfig) -> None:
             f"{len(job.scene.views)} views{how}"
         ]
 
-    levels = method_of(job).level_files[0]
-    inputs = [*run.scene_files, run.labels, run.provenance("train"), levels, *label_image_inputs(run)]
+    levels = method_of(job).level_files[:2]
+    inputs = [*run.scene_files, run.labels, run.provenance("train"), *levels, *label_image_inputs(run)]
     settings = {"distance": config.distance}
     run_stage(job, "observe", settings, inputs, [run.observations], make)
 

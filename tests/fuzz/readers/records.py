@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt import eq3, fidelity, plan_files, viewpoint, viewpoints
+from sagesplat.adapt import cell_models, cells, eq3, fidelity, plan_files, viewpoint, viewpoints
 from sagesplat.adapt.evaluate import Evaluation, read_evaluation
 from sagesplat.adapt.observe import Observations, read_observations
 from sagesplat.core.events import Event
@@ -108,6 +108,21 @@ def _models(folder: Path, size: int) -> list[bytes]:
     params = {field.name: 0.5 for field in fields(eq3.Eq3)}
     curve = CURVE | {"params": params, "status": sorted(eq3.STATUSES)[0]}
     return as_json({"models": [curve | {"level": 1 + i} for i in range(size)]})
+
+
+def _fidelity(folder: Path, size: int) -> list[bytes]:
+    promise = json.loads(_promises(folder, 1)[0])["promises"][0]
+    names = ("extent", "focal", "screens", "lengths", "photos", "rmse", "quality", "calibration")
+    cell = {"cell": 1, "offsets": [0.5, 1.0], "rows": [0, 1], "log_distances": [0.1, 0.2]}
+    cell |= {"median_log_distance": 0.1, "weights": [[0.1, 0.2], [0.0, 0.0]], "factors": [0.5, -1.0]}
+    entry = {name: promise[name] for name in names} | {"views": [[0.1] * 7, [0.2] * 7], "cells": [cell]}
+    return as_json({"models": [entry | {"label_id": 2 + i} for i in range(size)]})
+
+
+def _write_cells(path: Path, size: int) -> None:
+    ids, ones = np.arange(size), np.ones(size)
+    grid = np.full((size, cells.POINTS, 4), 9, np.uint8)
+    cells.write_cells(path, cells.Cells(ids, ids // 2, np.ones((size, 6)), grid, ones, ones))
 
 
 def _promises(folder: Path, size: int) -> list[bytes]:
@@ -325,6 +340,8 @@ READERS = (
            file("m.json", read_json)),
     Reader("models", ".json", _models, file("models.json", eq3.read_models)),
     Reader("promises", ".json", _promises, file("promises.json", viewpoint.read_promises)),
+    Reader("fidelity", ".json", _fidelity, file("fidelity.json", cell_models.read_fidelity)),
+    Reader("cells", ".npz", written_by("c.npz", _write_cells), file("cells.npz", cells.read_cells), 1000),
     Reader("viewpoints", ".json", _viewpoints, file("viewpoints.json", viewpoints.read_viewpoints), 100),
     Reader("bundle-levels", ".json", _bundled, file("manifest.json", lambda p: levels_of(p.parent)), 100),
     Reader("camera-files", ".json", _camera_files, file("c.json", read_camera_file), 100),

@@ -436,8 +436,14 @@ def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     chosen = along(nested.qualities["ssim"].bound, costs.transfer_bytes, target=target) + 1
     ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
     increments = increments_of(job)
+    label_of = job.cells.label_of
     increment_files = {
-        (label, k + 1): {f"{c.uri} {c.level}": c.nbytes for c in shown(increments, label, k + 1)}
+        (label, k + 1): {
+            f"{c.uri} {c.cell} {c.level}": c.nbytes
+            for cell, of in label_of.items()
+            if of == label
+            for c in shown(increments, cell, k + 1)
+        }
         for label in costs.labels
         for k in range(costs.transfer_bytes.shape[1])
     }
