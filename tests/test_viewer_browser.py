@@ -321,7 +321,7 @@ def test_levels_that_replace_are_drawn_alone_and_change_in_one_frame(tmp_path: P
         files = [chunk for label, level in levels.items() for chunk in shown(contents.chunks, label, level)]
         return read_increments(contents.folder, files)
 
-    counts = (WHOLE, 2 * BASE, WHOLE, 350, 300, 470)
+    counts = (WHOLE, BASE, WHOLE, 350, 300, 470)
     seen, drawn = drawn_within_budgets(contents, tmp_path / "bundle", browser, counts, held)
     assert (4, 4, 4) in seen
     assert min(seen)[0] < 3  # below the level that replaces, too
