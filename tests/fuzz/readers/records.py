@@ -113,8 +113,10 @@ def _models(folder: Path, size: int) -> list[bytes]:
 def _fidelity(folder: Path, size: int) -> list[bytes]:
     promise = json.loads(_promises(folder, 1)[0])["promises"][0]
     names = ("extent", "focal", "screens", "lengths", "photos", "rmse", "quality", "calibration")
-    cell = {"cell": 1, "offsets": [0.5, 1.0], "rows": [0, 1], "log_distances": [0.1, 0.2]}
-    cell |= {"median_log_distance": 0.1, "weights": [[0.1, 0.2], [0.0, 0.0]], "factors": [0.5, -1.0]}
+    cell = {
+        "cell": 1, "offsets": [0.5, 1.0], "rows": [0, 1], "log_distances": [0.1, 0.2],
+        "median_log_distance": 0.1, "weights": [[0.1, 0.2], [0.0, 0.0]], "factors": [0.5, -1.0],
+    }  # fmt: skip
     entry = {name: promise[name] for name in names} | {"views": [[0.1] * 7, [0.2] * 7], "cells": [cell]}
     return as_json({"models": [entry | {"label_id": 2 + i} for i in range(size)]})
 
