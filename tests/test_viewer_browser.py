@@ -246,6 +246,7 @@ def browser() -> Iterator[Any]:
 def viewer(site: str, browser: Any) -> Iterator[Opened]:
     with open_page(f"{site}?ui=0", browser=browser) as opened:
         ready(opened)
+        assert not opened.page.is_visible("#notice")  # it would cover the scene
         yield opened
         assert opened.complaints == []
 
