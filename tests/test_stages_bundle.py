@@ -421,7 +421,8 @@ def test_parts_of_blocks_are_told_by_category(run: Path, tmp_path: Path, viewer:
     labels = {label["id"]: label for label in manifest_of(out)["labels"]}
     a, b = labels[3], labels[184]
     assert (a["name"], b["name"]) == ("car@0", "car@2")
-    assert (a["title"], a["color"]) == (b["title"], b["color"])
+    assert (a["title"], b["title"]) == ("car (block 0)", "car (block 2)")
+    assert a["color"] == b["color"]
     assert (a["weight"], b["weight"], a["always"], b["always"]) == (3, 5, True, True)
     with pytest.raises(RunError, match=r"bike: no such category; there are car.*NAME@BLOCK"):
         bundle(job, out, always=["bike"], viewer=viewer)
