@@ -159,7 +159,7 @@ def test_instances_are_a_tree_and_fold_back(editing: Opened) -> None:
     chair = page.locator(".labels > li", has_text="chair")
     assert chair.count() == 1
     assert "2 instances" in chair.inner_text()
-    chair.locator(".blocks").first.click()
+    chair.locator(".instances").first.click()
     assert chair.locator(".parts .name").all_inner_texts() == ["chair 1", "chair 2"]
     choose(editing, "chair")
     assert said(editing).startswith("chair 1, chair 2 · ")
