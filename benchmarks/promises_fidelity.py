@@ -46,7 +46,7 @@ def measure(
     whole_scene = [plan for plan in plans_of(job) if plan.quality == "fidelity"]
     scenes = np.array([[plan.levels[i] for i in job.cells.labels.tolist()] for plan in whole_scene])
     scenes = np.broadcast_to(scenes[None], (views, *scenes.shape))
-    filled = method.planned_cells(expected, cameras, targets.tolist())
+    filled = method.planned_cells(expected, targets.tolist())
     asked = np.concatenate([planned, _equal(job, views), scenes, filled], 1)
     found, pixels = compositions_at(job, cameras, asked, "promises")
     if progress:
@@ -96,7 +96,7 @@ def by_condition(job: Job, views: int = 200, seed: int = 91_000) -> dict[str, An
         got, pixels = compositions_at(
             job, cameras, np.concatenate([planned, _equal(job, views)], 1), "promises"
         )
-        filled = method.planned_cells(expected, cameras, targets.tolist())
+        filled = method.planned_cells(expected, targets.tolist())
         best = _perfect(measured_levels(job, cameras), expected, costs, targets)
         shown = shown_enough(pixels, cameras) & [label in method.fidelity for label in labels]
         promised = np.isfinite(needed(method.fidelity, expected, 0.9))

@@ -86,20 +86,17 @@ def quality_at(
     return Quality(kind or "ssim", mean, bound, far, calibrated)
 
 
-def quality_of_cells(
-    models: Mapping[int, FidelityModel],
-    expected: Expected,
-    sight: Float[np.ndarray, "V C"],
-) -> Quality:
-    """Predict the fidelity of categories with all their cells at one level; `sight`: the cells' distances."""
+def quality_of_cells(models: Mapping[int, FidelityModel], expected: Expected) -> Quality:
+    """Predict the fidelity of categories with all their cells at one level."""
     V, C, K = expected.mean.shape
     mean = np.full((V, len(expected.labels), K), np.nan)
     bound = mean.copy()
     for k in range(K):
         mean[..., k] = expected.of_composition(np.full((V, C), k + 1))
         bound[..., k] = promised(models, expected, mean[..., k])
-    member = expected.column[:, None] == np.arange(len(expected.labels))
-    far = np.where(member, np.nan_to_num(sight, nan=np.inf)[..., None], np.inf).min(1, initial=np.inf)
+    far = np.where(expected.member, np.nan_to_num(expected.distance, nan=np.inf)[..., None], np.inf).min(
+        1, initial=np.inf
+    )
     certain = [label in models and models[label].status == "calibrated" for label in expected.labels.tolist()]
     return Quality("fidelity", mean, bound, np.where(np.isinf(far), np.nan, far), np.array(certain, bool))
 

@@ -18,9 +18,10 @@ direction and screen to the nearest known view; below `least_support` nothing is
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sagesplat.adapt.cells import Cells, Sight, look
 from sagesplat.adapt.process import inputs_of, matern32
@@ -30,10 +31,11 @@ from sagesplat.adapt.viewpoint import (
     Calibration,
     QualityKind,
     Status,
+    check_parts,
     monotone,
     where,
 )
-from sagesplat.core.limits import LARGEST, LabelId, Number, Positive
+from sagesplat.core.limits import LabelId, Number, Positive
 from sagesplat.io.files import write_json
 from sagesplat.io.typed import read_json_as, refused, to_plain
 from sagesplat.scene.scene import Camera
@@ -70,7 +72,7 @@ class FidelityModel:
     cells: tuple[CellModel, ...]  # ascending
     rmse: Number  # of the category at equal levels, each view predicted without itself; over all levels
     calibration: Calibration = field(default=NO_CALIBRATION)
-    quality: QualityKind = "fidelity"
+    quality: ClassVar[QualityKind] = "fidelity"
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -102,24 +104,29 @@ class Expected:
     column: Int[np.ndarray, " C"]  # of each cell's category among the labels
     mean: Float[np.ndarray, "V C K"]  # NaN: of a category without a model
     share: Float[np.ndarray, "V C"]  # of the picture's pixels; 0: out of sight
+    distance: Float[np.ndarray, "V C"]  # world units; NaN: out of sight
     support: Float[np.ndarray, "V L"]  # NaN without a model
     away: Float[np.ndarray, " V"]  # 0 at a photo, 1 far from all
 
     def at(self, view: int) -> "Expected":
         """What is expected from one of the viewpoints."""
         one = slice(view, view + 1)
-        arrays = {name: getattr(self, name)[one] for name in ("mean", "share", "support", "away")}
+        arrays = {name: getattr(self, name)[one] for name in ("mean", "share", "distance", "support", "away")}
         return replace(self, **arrays)
+
+    @property
+    def member(self) -> Bool[np.ndarray, "C L"]:
+        """Which cells are of which categories."""
+        return self.column[:, None] == np.arange(len(self.labels))
 
     def category_shares(self) -> Float[np.ndarray, "V L"]:
         """Share of the picture's pixels of each category."""
-        return self.share @ (self.column[:, None] == np.arange(len(self.labels)))
+        return self.share @ self.member
 
     def of_composition(self, levels: Int[np.ndarray, "V C"]) -> Float[np.ndarray, "V L"]:
         """Expected fidelity of each category in compositions (levels from 1); NaN out of sight."""
         at = np.take_along_axis(self.mean, levels[..., None] - 1, 2)[..., 0]
-        member = self.column[:, None] == np.arange(len(self.labels))
-        seen = self.share > 0
+        member, seen = self.member, self.share > 0
         value, weight = np.where(seen, self.share * at, 0) @ member, self.share @ member
         return np.where(weight > 0, value / np.where(weight > 0, weight, 1), np.nan)
 
@@ -150,7 +157,7 @@ def expect(
     share = sight.apparent * factor
     share /= np.maximum(share.sum(1, keepdims=True), 1)
     share = np.where(sight.apparent > 0, np.maximum(share, LEAST_SHARE), 0)
-    return Expected(cells.ids, labels, column, mean, share, support, away)
+    return Expected(cells.ids, labels, column, mean, share, sight.distance, support, away)
 
 
 def inputs_at(model: FidelityModel, cameras: Sequence[Camera]) -> Float[np.ndarray, "V 7"]:
@@ -243,9 +250,10 @@ def read_fidelity(path: Path | str) -> dict[int, FidelityModel]:
 
 def _check(model: FidelityModel) -> None:
     """ValueError for a model whose parts do not belong together."""
-    V, calibration = len(model.views), model.calibration
+    V = len(model.views)
     if not (model.cells and len(model.cells[0].offsets) and V and model.photos.size):
         raise ValueError("a model of nothing")
+    check_parts(model.calibration, model.screens, model.views, model.photos)
     for cell in model.cells:
         K, n = cell.weights.shape
         if (len(cell.rows), len(cell.log_distances)) != (n, n) or len(cell.factors) != V:
@@ -255,15 +263,4 @@ def _check(model: FidelityModel) -> None:
         if n and (cell.rows.min() < 0 or cell.rows.max() >= V):
             raise ValueError("views out of range")
         numbers = cell.offsets, cell.log_distances, cell.weights, cell.factors
-        if not all((np.abs(array) < LARGEST).all() for array in numbers):
-            raise ValueError("numbers out of range")
-    targets, thresholds, slopes = calibration.targets, calibration.thresholds, calibration.slopes
-    if not targets.shape == thresholds.shape == slopes.shape:
-        raise ValueError("lists of unequal length")
-    if not (np.diff(targets) > 0).all() or not (np.abs(targets) <= 1).all():
-        raise ValueError("targets out of range")
-    if not model.screens[0] <= model.screens[1]:
-        raise ValueError("screens out of order")
-    arrays = model.views, model.photos, thresholds, slopes
-    if not all((np.abs(array) < LARGEST).all() for array in arrays):
-        raise ValueError("numbers out of range")
+        check_parts(NO_CALIBRATION, model.screens, *numbers)

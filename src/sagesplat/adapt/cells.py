@@ -171,7 +171,7 @@ def write_cells(path: Path, cells: Cells) -> None:
 
 def read_cells(path: Path) -> Cells:
     """What `write_cells` wrote; DataError where the content cannot be used."""
-    cure = "delete it and run `sagesplat nest` again"
+    cure = f"{'delete it and ' if path.exists() else ''}run `sagesplat nest` again"
     try:
         with Npz(path) as file:
             arrays: dict[str, Any] = {field.name: file[field.name] for field in fields(Cells)}

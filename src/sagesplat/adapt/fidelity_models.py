@@ -232,7 +232,7 @@ def trial_of(
     """What compositions of `plan_nominal` measured, beside what is promised of them."""
     composed = [expected.of_composition(planned[:, j]) for j in range(len(NOMINAL))]
     bound = np.stack([promised(models, expected, mean) for mean in composed], 1)
-    steps = np.diff(planned, axis=1) @ (expected.column[:, None] == np.arange(len(expected.labels)))
+    steps = np.diff(planned, axis=1) @ expected.member
     return Trial(expected.labels.tolist(), shown, expected.support, bound, np.maximum(steps, 0), fidelity)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from sagesplat.core.errors import RunError
-from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.gaussians import Gaussians, concat, relabelled
 from sagesplat.core.second_opacity import SecondOpacities, blended
 from sagesplat.formats.levels import (
     LevelFile,
@@ -211,12 +211,8 @@ class NestedLadder(Ladder):
 
     def by_label(self, g: Gaussians) -> Gaussians:
         """Gaussians of cells with the label ids of their categories, the rows of each together."""
-        ids = np.array(sorted(self.label_of))
-        labels = np.array([self.label_of[cell] for cell in ids.tolist()], np.int16)
-        found = torch.from_numpy(labels[np.searchsorted(ids, g.label_ids.cpu().numpy())]).to(
-            g.label_ids.device
-        )
-        g = replace(g, label_ids=found)
+        g = relabelled(g, self.label_of)
+        found = g.label_ids
         if (found[1:] < found[:-1]).any():
             g = g.select(torch.argsort(found, stable=True))
         return g

@@ -264,19 +264,21 @@ def read_promises(path: Path | str) -> dict[int, ViewModel]:
 
 def _check(model: ViewModel) -> None:
     """ValueError for a model whose parts do not belong together."""
-    n, calibration = len(model.heldout_inputs), model.calibration
+    n = len(model.heldout_inputs)
     shapes = (len(model.inputs), *model.weights.shape)
     if not n or not model.curves or shapes != (n, n, len(model.curves)):
         raise ValueError("lists of unequal length")
+    check_parts(model.calibration, model.screens, model.inputs, model.photos, model.weights)
+
+
+def check_parts(calibration: Calibration, screens: tuple[float, float], *numbers: np.ndarray) -> None:
+    """ValueError for parts of a model that no calibration, screens or numbers of it can have."""
     targets, thresholds, slopes = calibration.targets, calibration.thresholds, calibration.slopes
     if not targets.shape == thresholds.shape == slopes.shape:
         raise ValueError("lists of unequal length")
     if not (np.diff(targets) > 0).all() or not (np.abs(targets) <= 1).all():
         raise ValueError("targets out of range")
-    if not model.screens[0] <= model.screens[1]:
+    if not screens[0] <= screens[1]:
         raise ValueError("screens out of order")
-    if not all(
-        (np.abs(array) < LARGEST).all()
-        for array in (model.inputs, model.photos, model.weights, thresholds, slopes)
-    ):
+    if not all((np.abs(array) < LARGEST).all() for array in (*numbers, thresholds, slopes)):
         raise ValueError("numbers out of range")

@@ -1,6 +1,6 @@
 """The Gaussians type: a labelled splat scene as plain tensors."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -87,6 +87,13 @@ def checked(g: Gaussians) -> Gaussians:
     if any(p.dtype != torch.float32 for p in g.parameters().values()) or g.label_ids.dtype != torch.int16:
         raise ValueError("parameters are not float32, or label_ids not int16")
     return g
+
+
+def relabelled(g: Gaussians, label_of: Mapping[int, int]) -> Gaussians:
+    """The same Gaussians with other label ids, by those that they have."""
+    before = torch.tensor(sorted(label_of), device=g.label_ids.device, dtype=g.label_ids.dtype)
+    after = torch.tensor([label_of[i] for i in sorted(label_of)], device=before.device, dtype=before.dtype)
+    return replace(g, label_ids=after[torch.searchsorted(before, g.label_ids)])
 
 
 def concat(parts: Sequence[Gaussians]) -> Gaussians:

@@ -1,7 +1,6 @@
 """Writes streamed SOG, levels of detail for PlayCanvas's viewers; `lod_meta.py` has the layout."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import torch
 from jaxtyping import Float32
 
 from sagesplat.core.errors import DataError
-from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.gaussians import Gaussians, relabelled
 from sagesplat.formats.lod_meta import LOD_META
 from sagesplat.formats.sog_write import GENERATOR, put_sog, sog_files, sog_order
 from sagesplat.formats.splat import SplatWriter
@@ -69,7 +68,7 @@ def write_lod_meta(
                     count = len(rows[cell])
                     leaves[cell]["lods"][str(lod)] = {"file": len(files), "offset": first, "count": count}
                     first += count
-                inside = _labelled(
+                inside = relabelled(
                     g.select(torch.from_numpy(np.concatenate([rows[c] for c in part]))), label_of
                 )
                 (fresh / name).mkdir()
@@ -108,13 +107,6 @@ def _files(rows: Mapping[int, np.ndarray], largest: int) -> list[list[int]]:
         files[-1].append(cell)
         count += len(own)
     return files
-
-
-def _labelled(g: Gaussians, label_of: Mapping[int, int]) -> Gaussians:
-    """Gaussians of cells with the label ids of their categories."""
-    cells, column = np.unique(g.label_ids.numpy(), return_inverse=True)
-    labels = np.array([label_of[cell] for cell in cells.tolist()], np.int16)
-    return replace(g, label_ids=torch.from_numpy(labels[column]))
 
 
 def _extents(g: Gaussians) -> Float32[np.ndarray, "2 N 3"]:

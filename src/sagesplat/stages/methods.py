@@ -19,7 +19,6 @@ from sagesplat.adapt.bound_plans import (
     quality_of_cells,
 )
 from sagesplat.adapt.cell_models import Expected, FidelityModel, expect, write_fidelity
-from sagesplat.adapt.cells import look
 from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
@@ -99,7 +98,7 @@ class NestedLevels(Method):
         far = job.distances(job.fit_config.distance)
         cameras = [view.camera for view in job.scene.views]
         return {
-            "fidelity": self._of_cells(self._expected, cameras),
+            "fidelity": quality_of_cells(self.fidelity, self._expected),
             "ssim": quality_at(self.costs, self.promises, far, cameras, "ssim"),
         }
 
@@ -111,9 +110,6 @@ class NestedLevels(Method):
     def expect(self, cameras: Sequence[Camera]) -> Expected:
         """What cameras are expected to see of the cells."""
         return expect(self.fidelity, self.job.cells, cameras, len(self.job.ladder.levels))
-
-    def _of_cells(self, expected: Expected, cameras: Sequence[Camera]) -> Quality:
-        return quality_of_cells(self.fidelity, expected, look(self.job.cells, cameras).distance)
 
     @cached_property
     def shown(self) -> np.ndarray:
@@ -186,18 +182,16 @@ class NestedLevels(Method):
             found = quality_at(self.costs, self.promises, far, [camera], quality)
             return replace(plan_for_view(found, self.costs, target, 0), view=None)
         expected = self.expect([camera])
-        found = self._of_cells(expected, [camera])
+        found = quality_of_cells(self.fidelity, expected)
         plan = plan_for_cells(self.fidelity, expected, found, self.cell_costs, target, 0)
         return replace(plan, view=None)
 
-    def planned_cells(
-        self, expected: Expected, cameras: Sequence[Camera], targets: Sequence[float]
-    ) -> np.ndarray:
-        """Levels of the cells in the plans for fidelity at cameras, [V, J, C]."""
-        quality, costs = self._of_cells(expected, cameras), self.cell_costs
+    def planned_cells(self, expected: Expected, targets: Sequence[float]) -> np.ndarray:
+        """Levels of the cells in the plans for fidelity at the viewpoints, [V, J, C]."""
+        quality, costs = quality_of_cells(self.fidelity, expected), self.cell_costs
         plans = [
             [plan_for_cells(self.fidelity, expected, quality, costs, target, row) for target in targets]
-            for row in range(len(cameras))
+            for row in range(len(expected.share))
         ]
         return np.array([[list((plan.cells or {}).values()) for plan in of_view] for of_view in plans])
 

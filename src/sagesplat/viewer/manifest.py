@@ -118,8 +118,7 @@ class Contents:
     @cached_property
     def shown(self) -> Cells:
         """The cells that have files."""
-        kept = np.isin(self.cells.ids, list(self.files))
-        return Cells(**{name: array[kept] for name, array in vars(self.cells).items()})
+        return self.cells.select(np.flatnonzero(np.isin(self.cells.ids, list(self.files))))
 
     @cached_property
     def models(self) -> dict[int, FidelityModel]:

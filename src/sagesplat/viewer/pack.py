@@ -20,14 +20,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sagesplat.adapt.cell_models import FidelityModel, expect, needed
+from sagesplat.adapt.cell_models import LEAST_SHARE, FidelityModel, expect, needed
 from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.cells import Cells
 from sagesplat.scene.scene import Camera
 
 # of the first view, as in the viewer on a usual screen
 FOV_Y, ASPECT, HEIGHT = math.radians(60), 16 / 9, 1080
-_LEAST_SHARE = 1e-4  # least pixel share, so that every cell in sight counts
 _LEAST = 1e-6  # least gain
 
 
@@ -76,7 +75,7 @@ def order_of(
         total = np.cumsum(np.take(ladder.sizes, path - 1), dtype=np.float64)
         known = not np.isnan(mean[row]).any()
         quality = mean[row, path - 1] if known else np.sqrt(total / total[-1])
-        weight = max(ladder.weight * max(float(share[row]), _LEAST_SHARE), _LEAST**2)
+        weight = max(ladder.weight * max(float(share[row]), LEAST_SHARE), _LEAST**2)
         ranked.append((0 if visible else 1, -weight / total[0], cell, 1))
         for k, gain in zip(path[1:].tolist(), gains_of(quality, total).tolist(), strict=True):
             rank = 4 if not visible else 2 if k <= wanted[row] else 3

@@ -112,7 +112,7 @@ def _models(folder: Path, size: int) -> list[bytes]:
 
 def _fidelity(folder: Path, size: int) -> list[bytes]:
     promise = json.loads(_promises(folder, 1)[0])["promises"][0]
-    names = ("extent", "focal", "screens", "lengths", "photos", "rmse", "quality", "calibration")
+    names = ("extent", "focal", "screens", "lengths", "photos", "rmse", "calibration")
     cell = {
         "cell": 1, "offsets": [0.5, 1.0], "rows": [0, 1], "log_distances": [0.1, 0.2],
         "median_log_distance": 0.1, "weights": [[0.1, 0.2], [0.0, 0.0]], "factors": [0.5, -1.0],
