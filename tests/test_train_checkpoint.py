@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import PARAMETERS
+from sagesplat.train import checkpoint
 from sagesplat.train.checkpoint import _checksum, read_checkpoint, write_checkpoint
 from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.view_parameters import ViewParameters
@@ -31,6 +32,17 @@ def some_state() -> TrainState:
     state.per_view = {"pose": ViewParameters.zeros(8, 6), "exposure": ViewParameters.zeros(8, 12)}
     state.per_view["pose"].adam_step([3], torch.rand(1, 6, generator=generator), 0.1)
     return state
+
+
+def test_writing_takes_a_small_part_of_the_time(monkeypatch):
+    now = iter([0.0, 10.0, 12.0, 51.9, 52.0])  # asked, written from, to, asked, asked
+    monkeypatch.setattr(checkpoint.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(checkpoint, "write_checkpoint", lambda *_: None)
+    pace = checkpoint.Pace()
+    assert pace.due()
+    pace.write(Path("x.npz"), some_state(), "")
+    assert not pace.due()
+    assert pace.due()
 
 
 def test_round_trip_is_identical(tmp_path):

@@ -1,5 +1,7 @@
 """The pace of training: published rates, larger ones that come down to them, and resolutions by frequency."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import pinhole
@@ -92,3 +94,6 @@ def test_small_photos_ask_for_few_gaussians():
     assert densify.budget(config, plan, plan.refine_stop, 100_000, 25_000, 1000) == 37_500
     assert densify.budget(config, plan, plan.refine_stop, 100_000, 25_000, 40_000) == 80_000
     assert densify.budget(config, plan, plan.refine_start, 100_000, 25_000, 1000) == 1000
+    many = replace(config, max_gaussians=1_000_000)
+    assert densify.budget(many, plan, plan.refine_stop, 100_000, 100_000, 1000) == 1_000_000
+    assert densify.budget(many, plan, plan.refine_stop, 100_000, 25_000, 1000) == 250_000

@@ -20,7 +20,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import photometric_loss, psnr, ssim_map
 from sagesplat.metrics.lpips import Net, load_lpips
 from sagesplat.raster import rasterize
-from sagesplat.train import trainer
+from sagesplat.train import densify, trainer
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views
 from sagesplat.train.events import LevelSaved, Step, Trained
 from sagesplat.train.parallel import train_together
@@ -29,7 +29,10 @@ from sagesplat.train.strategy import schedule_of
 
 AS_GSPLAT: dict[str, Any] = {"lr_schedule": "published", "antialiased": False}  # its example's defaults
 KEPT_BACK = 0.1  # of the time, for what comes after the long runs
-WEIGHTS = {"ours": 1.0, "gsplat": 1.3, "third": 0.8, "two_thirds": 0.7, "all": 0.5}  # time of a run, guessed
+LARGE = 4_000_000  # Gaussians of `large`: ours with about as many as gsplat makes of garden
+WEIGHTS = {  # time of a run, guessed
+    "ours": 1.0, "gsplat": 1.3, "mcmc": 0.9, "large": 1.3, "third": 0.8, "two_thirds": 0.7, "all": 0.5,
+}  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -87,13 +90,13 @@ def full(bench: Bench) -> Outcome:
 
 
 def race(bench: Bench) -> Outcome:
-    """gsplat's recipe, ours, and ours with the freeze: time to the same SSIM on test views."""
+    """gsplat's recipes, ours, and ours with the freeze: time to the same SSIM on test views."""
     runs: dict[str, Run] = {}
     missed: dict[str, str] = {}
-    hopeless = {"gsplat": "it needs a GPU"} if bench.small else {}
+    hopeless = dict.fromkeys(("gsplat", "mcmc", "large"), "it needs a GPU") if bench.small else {}
     if bench.masks is None:
         hopeless |= dict.fromkeys(("third", "two_thirds", "all"), "no label images")
-    for name in bench.asked.runs or ("gsplat", "ours", "third", "two_thirds", "all"):
+    for name in bench.asked.runs or WEIGHTS:
         if name in hopeless:
             missed[name] = hopeless[name]
             continue
@@ -187,14 +190,19 @@ def run_of(bench: Bench, name: str) -> Run:
 def _train(bench: Bench, name: str) -> Run:
     if bench.left() < KEPT_BACK * 60 * bench.asked.minutes:
         raise RuntimeError("no time left")
-    if name in ("ours", "gsplat"):
-        config = TrainConfig(max_steps=steps_of(bench), **AS_GSPLAT)
+    if name in ("ours", "gsplat", "mcmc", "large"):
+        most = LARGE if name == "large" else 0
+        config = TrainConfig(max_steps=steps_of(bench), max_gaussians=most, **AS_GSPLAT)
     elif bench.masks is None:
         raise RuntimeError("no label images: nothing to freeze")
     else:
         target = targets(run_of(bench, "ours").label_ssim)[name]
         config = TrainConfig(max_steps=steps_of(bench), freeze_at=target, **AS_GSPLAT)
-    run = watch(bench, name, config, (gsplats if name == "gsplat" else ours)(bench, config))
+    if name in ("gsplat", "mcmc"):
+        moments = gsplats(bench, config, mcmc=name == "mcmc")
+    else:
+        moments = ours(bench, config)
+    run = watch(bench, name, config, moments)
     if name == "ours":
         bench.trained = run.gaussians
     last = run.curve[-1]
@@ -209,9 +217,9 @@ def steps_of(bench: Bench) -> int:
         if bench.chosen("race") or bench.chosen("freeze"):
             names = [name for name in WEIGHTS if name in (bench.asked.runs or WEIGHTS)]
         if bench.masks is None:
-            names = [name for name in names if name in ("ours", "gsplat")]
+            names = [name for name in names if name in ("ours", "gsplat", "mcmc", "large")]
         if not bench.chosen("race") or bench.small:
-            names = [name for name in names if name != "gsplat"]
+            names = [name for name in names if name not in ("gsplat", "mcmc", "large")]
         took = stages(bench, grown(bench), repeats=3 if bench.small else 60)["step"]
         room = bench.left() - KEPT_BACK * 60 * bench.asked.minutes
         room -= 0 if bench.small else 8 * len(names)  # looking at the models takes time too
@@ -234,12 +242,16 @@ def ours(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
             yield Moment(state.step, state.gaussians, dict(state.frozen))
 
 
-def gsplats(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
-    """gsplat's recipe; its photos are on the device before the clock starts."""
+def gsplats(bench: Bench, config: TrainConfig, mcmc: bool = False) -> Iterator[Moment]:
+    """gsplat's recipe, or its MCMC with as many Gaussians as ours; photos are on the device at the start."""
     rows = bench.scene.train_ids.tolist()
     photos = [torch.from_numpy(bench.photos[row]).to(bench.device).float() / 255 for row in rows]
     cameras, (_, loss) = [bench.scene.views[row].camera for row in rows], gsplat_trainer.losses()
-    moments = gsplat_trainer.train(bench.initial(), cameras, photos, bench.scene.extent, config, loss)
+    camera, points = cameras[0], len(bench.scene.points.xyz)
+    most = densify.cap(config, camera.width * camera.height, points) if mcmc else 0
+    moments = gsplat_trainer.train(
+        bench.initial(), cameras, photos, bench.scene.extent, config, loss, cap=most
+    )
     return (Moment(step, g) for step, g in moments)
 
 
@@ -280,7 +292,7 @@ def watch(bench: Bench, name: str, config: TrainConfig, moments: Iterator[Moment
     peak = torch.cuda.max_memory_allocated(bench.device) / 2**20 if bench.device.type == "cuda" else 0.0
     settings: dict[str, Any] = {"max_steps": config.max_steps, "freeze_at": config.freeze_at}
     settings |= {"frozen": dict(last.frozen), "skipped": skipped(bench, last.frozen)}
-    if name == "gsplat":
+    if name in ("gsplat", "mcmc"):
         settings["loss"] = gsplat_trainer.losses()[0]
     g = last.gaussians.to("cpu")
     return Run(name, last.step, clock.seconds, curve, g, peak, stopped, label_ssim, settings)

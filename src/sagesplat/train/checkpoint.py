@@ -6,6 +6,7 @@ The previous one is kept beside it (checkpoint-1.npz), in case the newest file i
 import json
 import os
 import shutil
+import time
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -23,6 +24,7 @@ from sagesplat.train.state import SECOND, TrainState
 from sagesplat.train.view_parameters import ViewParameters
 
 _VERSION = 3
+_APART = 20  # times as long as writing takes passes between two
 _OF_VIEWS = ("values", "exp_avg", "exp_avg_sq", "counts")  # of `ViewParameters`
 # what truncated or changed files raise
 _DAMAGED = (OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError)
@@ -86,6 +88,24 @@ def write_checkpoint(path: Path, state: TrainState, settings: str) -> None:
         np.savez(temporary, allow_pickle=False, **arrays, meta=np.array(json.dumps(meta)))
         _verify(temporary, path)
         _keep(path)
+
+
+class Pace:
+    """Keeps the writing of checkpoints below a twentieth of the time: a GPU takes 500 steps in a second."""
+
+    def __init__(self) -> None:
+        self._next = 0.0
+
+    def due(self) -> bool:
+        """Whether enough time has passed since the last one."""
+        return time.monotonic() >= self._next
+
+    def write(self, path: Path, state: TrainState, settings: str) -> None:
+        """`write_checkpoint`, timed."""
+        begin = time.monotonic()
+        write_checkpoint(path, state, settings)
+        end = time.monotonic()
+        self._next = end + _APART * (end - begin)
 
 
 def _checksum(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> int:

@@ -59,7 +59,8 @@ def budget(
 
     most = cap(config, num_pixels, num_points)
     share = min(1.0, (step - plan.refine_start) / max(1, plan.refine_stop - plan.refine_start))
-    return min(num_points + int(share * (most - num_points)), _distinct(pixels_now, num_points))
+    now = max(_distinct(pixels_now, num_points), int(most * pixels_now / num_pixels))
+    return min(num_points + int(share * (most - num_points)), now)
 
 
 def cap(config: TrainConfig, num_pixels: int, num_points: int) -> int:

@@ -23,7 +23,7 @@ from sagesplat.scene.scene import Points, Scene
 from sagesplat.segment.masks import Masks
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
 from sagesplat.train.cells import split_cells
-from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
+from sagesplat.train.checkpoint import Pace, latest_checkpoint
 from sagesplat.train.early_stopping import ActiveTiles, trainable_rows
 from sagesplat.train.events import Event, Resumed
 from sagesplat.train.importance import importance
@@ -227,7 +227,7 @@ def nest(
         valid: The pixels that count; nothing is learnt from the others.
         seed: Of all random numbers.
         backend: Rasteriser; decides the device.
-        checkpoint: Where to save every 500 steps; one of the same `settings` is resumed.
+        checkpoint: Where to save, at most every 500 steps; one of the same `settings` is resumed.
         settings: What a checkpoint has to have been written with.
         movable: bool [N]; the others keep their values, and all keep their order. None: all are trained.
         spans: Levels that replace each other; all Gaussians keep their order. None: prefixes.
@@ -272,7 +272,7 @@ def nest(
     trainable = trainable_rows(state.gaussians, {})
     if movable is not None:
         trainable &= torch.from_numpy(movable[near]).to(device)
-    value, tail = 0.0, TailAverage(config.steps)
+    value, tail, pace = 0.0, TailAverage(config.steps), Pace()
     with named_failures(lambda: f"training on compositions stopped at step {state.step}"):
         while state.step < config.steps:
             if state.step in sort_at:
@@ -294,8 +294,8 @@ def nest(
             saves = state.step % _SAVE_EVERY == 0
             if device.type == "cpu" or saves or state.step % LOOK_EVERY == 0:  # looking waits for a GPU
                 value = finite(loss, state.step)
-            if checkpoint and saves:
-                write_checkpoint(checkpoint, state, settings)
+            if checkpoint and saves and pace.due():
+                pace.write(checkpoint, state, settings)
             yield NestStep(state.step, value)
     assert state.order_share is not None
     sets = np.zeros(len(labels)) if spans is None else spans.last[near]

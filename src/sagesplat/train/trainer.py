@@ -23,7 +23,7 @@ from sagesplat.scene.scene import Scene
 from sagesplat.scene.vignetting_fit import estimate_vignetting
 from sagesplat.segment.masks import Masks
 from sagesplat.segment.valid import ALL_VALID, ValidPixels
-from sagesplat.train.checkpoint import latest_checkpoint, previous, write_checkpoint
+from sagesplat.train.checkpoint import Pace, latest_checkpoint, previous
 from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views, trainable_rows
 from sagesplat.train.events import Event, Found, LabelFrozen, LevelSaved, Resumed, Step, Trained
 from sagesplat.train.exposure import ExposureUpdate, exposure_update
@@ -163,7 +163,7 @@ class Training:
     def __post_init__(self) -> None:
         self.trainable = trainable_rows(self.state.gaussians, self.state.frozen)
         self.unfinished = bool(self.trainable.any())
-        self._saved = self.state.step
+        self._saved, self._pace = self.state.step, Pace()
 
     def run(self) -> Iterator[Event]:
         """Train to the end; the events of `train`."""
@@ -231,8 +231,9 @@ class Training:
         state = self.state
         ends = state.step == self.config.max_steps or not self.unfinished
         small = len(state.gaussians) <= _SMALL
-        if self.folder and (ends or small or state.step - self._saved >= _SAVE_EVERY):
-            write_checkpoint(self.folder / CHECKPOINT, state, self.settings)
+        later = state.step - self._saved >= _SAVE_EVERY and self._pace.due()
+        if self.folder and (ends or small or later):
+            self._pace.write(self.folder / CHECKPOINT, state, self.settings)
             self._saved = state.step
 
     def _stop_categories(self, target: float) -> Iterator[LabelFrozen]:
