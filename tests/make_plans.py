@@ -1,11 +1,10 @@
 """Test vectors of `adapt.allocate`, `fill` and `cell_plans`: `python tests/make_plans.py` writes them.
 
 A case of tests/data/plans.json has the arguments of a function (null: NaN in quality, inf in cost, an
-argument left out) and under "expected" what it returns. Modes: "target" is `cheapest`, "budget" is
-`best_within`, either is `along` where quality has positions, "fill" is `fill` from "levels" on, "cells" is
+argument left out) and under "expected" what it returns. Modes: "target" is `cheapest`, or
+`along` where quality has positions, "fill" is `fill` from "levels" on, "cells" is
 `reach` for labels that need a mean "theta" (null: no promise) over their cells; cells out of sight, and those
-of a label of weight 0, have no share. Levels, status, cost, missed and optimal are to be equal, value and
-bound to 1e-9 of themselves.
+of a label of weight 0, have no share.
 """
 
 import json
@@ -15,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt.allocate import along, best_within, cheapest
+from sagesplat.adapt.allocate import along, cheapest
 from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.fill import fill
 
 PATH = Path(__file__).parent / "data" / "plans.json"
 Case = dict[str, Any]
 NAN, INF = math.nan, math.inf
-ARGUMENTS = ("target", "budget", "weight", "previous", "slack", "states")
+ARGUMENTS = ("target", "previous", "slack")
 
 Q = [[0.5, 0.7, 0.8, 0.85], [0.6, 0.75, 0.9, 0.95], [0.3, 0.4, 0.6, 0.7]]
 C = [[10, 20, 40, 80], [5, 15, 30, 60], [20, 30, 70, 90]]
@@ -31,57 +30,23 @@ W = [1, 2, 0.5]
 
 def _by_hand() -> list[Case]:
     some = ([[NAN, 0.7, 0.8, NAN], Q[1], [0.3, NAN, NAN, 0.7]], C)
-    one, two = ([[0.5, 0.7, 0.9]], [[1, 4, 9]]), ([[0.5, 0.8], [0.4, 0.9]], [[2, 5], [3, 7]])
+    one = [[0.5, 0.7, 0.9]], [[1, 4, 9]]
     bumpy = ([[0.6, 0.9, 0.7, 0.9], [0.8, 0.5, 0.85, 0.6]], [[1, 3, 4, 6], [2, 3, 5, 9]])
     unknown = [Q[0], [NAN] * 4, Q[2]]
     cases = [
         ("one label", *one, {"target": 0.7}),
-        ("one label", *one, {"budget": 8, "weight": [1]}),
         ("one level", [[0.5], [0.9]], [[3], [4]], {"target": 0.6}),
-        ("one level", [[0.5], [0.9]], [[3], [4]], {"budget": 7, "weight": [1, 1]}),
-        ("one level, over budget", [[0.5], [0.9]], [[3], [4]], {"budget": 6, "weight": [1, 1]}),
         ("equal costs, the higher quality", [[0.5, 0.7, 0.6]], [[4, 4, 4]], {"target": 0.5}),
-        ("equal costs, the higher quality", [[0.5, 0.7, 0.6]], [[4, 4, 4]], {"budget": 4, "weight": [1]}),
-        ("equal costs, weight 0", [[0.5, 0.7, 0.7], [0.2, 0.4, 0.4]], [[4] * 3, [2, 2, 5]],
-         {"budget": 20, "weight": [0, 1]}),
         ("equal levels, the lower index", [[0.5, 0.7, 0.7]], [[1, 4, 4]], {"target": 0.6}),
-        ("equal levels, the lower index", [[0.5, 0.7, 0.7]], [[1, 4, 4]], {"budget": 9, "weight": [1]}),
-        ("equal labels, the later goes up", [[0.5, 0.8]] * 2, [[2, 5]] * 2, {"budget": 7, "weight": [1, 1]}),
-        ("equal values, the cheaper", [[0.5, 0.75], [0.5, 0.75]], [[2, 6], [2, 5]],
-         {"budget": 9, "weight": [1, 1]}),
         ("quality that falls", *bumpy, {"target": 0.7}),
-        ("quality that falls", *bumpy, {"budget": 8, "weight": [1, 2]}),
-        ("no cost at all", [[0.5, 0.7], [0.6, 0.4]], [[0, 0], [0, 0]], {"budget": 1, "weight": [1, 1]}),
-        ("budget of the smallest", *two, {"budget": 5, "weight": [1, 1]}),
-        ("budget below the smallest", *two, {"budget": 4.99, "weight": [1, 1]}),
-        ("budget of one step", *two, {"budget": 9, "weight": [1, 1]}),
-        ("budget of everything", *two, {"budget": 12, "weight": [1, 1]}),
-        ("budget just below everything", *two, {"budget": 11, "weight": [1, 1]}),
-        ("weights", Q, C, {"budget": 100, "weight": W}),
-        ("one weight 0", Q, C, {"budget": 150, "weight": [1, 0, 1]}),
-        ("all weights 0", Q, C, {"budget": 150, "weight": [0, 0, 0]}),
-        ("weights far apart", Q, C, {"budget": 150, "weight": [1e9, 1e-9, 3.0]}),
-        ("greedy is not the best", [[0.0, 0.6], [0.0, 0.9]], [[0, 6], [0, 10]],
-         {"budget": 10, "weight": [1, 1]}),
-        ("the same by greed alone", [[0.0, 0.6], [0.0, 0.9]], [[0, 6], [0, 10]],
-         {"budget": 10, "weight": [1, 1], "states": 0}),
-        ("costs of a thousand million", [[0.1, 0.5], [0.1, 0.5], [0.1, 0.5]],
-         [[1, 10**9], [2, 10**9 + 7], [3, 10**9 - 9]], {"budget": 2 * 10**9, "weight": [1, 1, 1]}),
-        ("target reached exactly", Q, C, {"target": 0.7, "weight": W}),
-        ("target out of reach", Q, C, {"target": 0.9, "weight": W}),
-        ("a target per label", Q, C, {"target": [0.6, 0.9, 0.7], "weight": W}),
+        ("target reached exactly", Q, C, {"target": 0.7}),
+        ("target out of reach", Q, C, {"target": 0.9}),
+        ("a target per label", Q, C, {"target": [0.6, 0.9, 0.7]}),
         ("target 1", [[0.9, 1.0, 1.0], [0.9, 0.95, 0.95]], [[1, 2, 2], [1, 2, 3]], {"target": 1}),
         ("no promise for a label", unknown, C, {"target": 0.7}),
-        ("no promise for a label", unknown, C, {"budget": 110, "weight": W}),
         ("no promise at all", [[NAN] * 4] * 3, C, {"target": 0.7}),
-        ("no promise at all", [[NAN] * 4] * 3, C, {"budget": 130, "weight": W}),
         ("no promise for some levels", *some, {"target": 0.65}),
-        ("no promise for some levels", *some, {"budget": 120, "weight": W}),
         ("fewer levels", Q, [C[0], [INF, 15, 30, INF], [20, INF, INF, INF]], {"target": 0.8}),
-        ("fewer levels", Q, [C[0], [INF, 15, 30, INF], [20, INF, INF, INF]], {"budget": 100, "weight": W}),
-        ("levels without promise, fewer of them", [[NAN] * 3, [0.2, 0.5, 0.9]], [[2, 8, INF], [1, 4, 8]],
-         {"budget": 12, "weight": [1, 1]}),
-        # hysteresis
         ("up at once", Q, C, {"target": 0.7, "previous": [0, 0, 0]}),
         ("stays above", [[0.6, 0.705, 0.8]], [[1, 2, 3]], {"target": 0.7, "previous": [2]}),
         ("comes down", [[0.6, 0.715, 0.8]], [[1, 2, 3]], {"target": 0.7, "previous": [2]}),
@@ -94,17 +59,8 @@ def _by_hand() -> list[Case]:
         ("no level before", Q, C, {"target": 0.7, "previous": [3, -1, -1]}),
         ("a level before that cannot be had", [[0.7, 0.8, 0.9]], [[1, 2, INF]],
          {"target": 0.75, "previous": [2]}),
-        ("stays within the slack", [[0.5, 0.8], [0.5, 0.805]], [[2, 5], [2, 5]],
-         {"budget": 7, "weight": [1, 1], "previous": [1, 0]}),
-        ("leaves for more than the slack", [[0.5, 0.8], [0.5, 0.85]], [[2, 5], [2, 5]],
-         {"budget": 7, "weight": [1, 1], "previous": [1, 0], "slack": 0.02}),
-        ("too much before", Q, C, {"budget": 100, "weight": W, "previous": [3, 3, 3]}),
-        ("stays by greed alone", Q, C, {"budget": 100, "weight": W, "previous": [1, 2, 0], "states": 0}),
     ]  # fmt: skip
-    return [
-        {"name": name, "mode": "target" if "target" in rest else "budget", "quality": q, "cost": c, **rest}
-        for name, q, c, rest in cases
-    ]
+    return [{"name": name, "mode": "target", "quality": q, "cost": c, **rest} for name, q, c, rest in cases]
 
 
 def _fills() -> list[Case]:
@@ -199,23 +155,17 @@ def scene(rng: np.random.Generator, *shape: int) -> tuple[np.ndarray, np.ndarray
 def _random() -> list[Case]:
     rng, cases = np.random.default_rng(7), []
     for labels, levels in ((2, 3), (3, 4), (4, 4), (5, 5), (12, 16), (40, 6)):
-        quality, cost, weight = scene(rng, 1, labels, levels)
-        least, most = cost.min(1).sum(), cost.max(1).sum()
-        case = {"quality": quality[0].tolist(), "cost": cost.tolist(), "weight": weight.tolist()}
+        quality, cost, _ = scene(rng, 1, labels, levels)
+        case = {"quality": quality[0].tolist(), "cost": cost.tolist()}
         name = f"{labels} labels of {levels} levels"
         cases.append({"name": name, "mode": "target", **case, "target": 0.8})
         before = rng.integers(0, levels, labels).tolist()
         cases.append({"name": name, "mode": "target", **case, "target": 0.7, "previous": before})
-        budget = float(np.floor(least + rng.uniform(0.1, 0.6) * (most - least)))
-        cases.append({"name": name, "mode": "budget", **case, "budget": budget})
-        cases.append({"name": name, "mode": "budget", **case, "budget": budget, "previous": before})
     for labels, levels in ((3, 4), (6, 5)):
-        quality, cost, weight = scene(rng, 12, labels, levels)
-        budget = float(np.floor(0.4 * cost.max(1).sum()))
-        case = {"quality": quality.tolist(), "cost": cost.tolist(), "weight": weight.tolist()}
+        quality, cost, _ = scene(rng, 12, labels, levels)
+        case = {"quality": quality.tolist(), "cost": cost.tolist()}
         name = f"a walk past {labels} labels of {levels} levels"
         cases.append({"name": name, "mode": "target", **case, "target": 0.8})
-        cases.append({"name": name, "mode": "budget", **case, "budget": budget})
     return cases
 
 
@@ -236,7 +186,7 @@ def expected(case: Case) -> Case:
         return {"levels": fill(np.array(case["levels"]), quality, cost, weight).tolist()}
     if quality.ndim == 3:
         return {"levels": along(quality, cost, **rest).tolist()}
-    plan = cheapest(quality, cost, **rest) if case["mode"] == "target" else best_within(quality, cost, **rest)
+    plan = cheapest(quality, cost, **rest)
     return {**vars(plan), "levels": plan.levels.tolist(), "missed": plan.missed.tolist()}
 
 

@@ -1,14 +1,17 @@
 """Plans for a viewpoint from lower bounds: levels, statuses, the fill; plans within a budget."""
 
+import itertools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import orbit
+from hypothesis import given
+from hypothesis import strategies as st
 
-from sagesplat.adapt.allocate import best_within
 from sagesplat.adapt.bound_plans import Costs, Quality, plan_for_view, plan_within, pooled, quality_at
+from sagesplat.adapt.cell_plans import within
 from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, QualityKind, ViewModel, constant_curve
 from sagesplat.core.errors import RunError
 
@@ -97,14 +100,28 @@ def test_quality_of_models_outside_of_their_support():
 def test_within_a_budget():
     pixels = np.array([100.0, 900.0, 10.0])
     plan = plan_within(np.array(MEAN), COSTS, 60, "bytes", pixels, "fidelity")
-    assert [level - 1 for level in plan.levels.values()] == best_within(
-        np.array(MEAN), BYTES, pixels, 60
-    ).levels.tolist()
     assert plan.transfer_bytes is not None
     assert plan.transfer_bytes <= 60
     assert (plan.status, plan.quality, plan.asked) == ("ok", "fidelity", "budget 60 bytes")
     assert replace(plan, budget=4e6, unit="gpu-bytes").asked == "budget 4,000,000 bytes of GPU memory"
     assert plan_within(np.array(MEAN), COSTS, 3, "bytes", pixels).status == "over budget"
+    with pytest.raises(RunError, match="budget nan is impossible; choose one above 0"):
+        plan_within(np.array(MEAN), COSTS, math.nan, "bytes", pixels)
+
+
+@given(st.integers(0, 999), st.floats(0.01, 1.1))
+def test_budgets_miss_the_best_by_less_than_an_upgrade(seed, share):
+    rng = np.random.default_rng(seed)
+    cost = np.cumsum(rng.integers(1, 50, (4, 3)), 1)
+    mean, weight = np.sort(rng.uniform(0, 1, (4, 3)), 1), rng.exponential(1, 4)
+    budget = cost[:, 0].sum() + share * (cost[:, -1] - cost[:, 0]).sum()
+    value, rows = weight[:, None] * mean, np.arange(4)
+    found = within(cost, mean, weight, budget)
+    assert cost[rows, found].sum() <= budget
+    every = np.array(list(itertools.product(range(3), repeat=4)))
+    fits = every[cost[rows, every].sum(1) <= budget]
+    best = value[rows, fits].sum(1).max()
+    assert best - (value[:, -1] - value[:, 0]).max() <= value[rows, found].sum() <= best + 1e-9
 
 
 def test_means_over_pixels_are_those_of_the_whole_images():

@@ -1,15 +1,10 @@
-"""Which level each label gets: the cheapest that keeps a target, or the most quality within a budget.
+"""Which level each label gets: the cheapest that keeps a target.
 
 Rules that a second implementation must share, so that both give the same levels (tests/data/plans.json):
-- Of equal levels the cheaper comes first, then the one of higher quality, then the lower index. Compositions
-  within a budget: more value, then less cost, then the lower level at the first label where they differ;
-  where a label's cheapest levels have the same value, the rule for levels decides between them.
-- Costs are whole numbers. Values are whole multiples of 2**-40 of the total weight, by floor(x + 0.5): sums
-  of both are exact in float64 in any order. Weights and reported values are summed label by label.
+- Of equal levels the cheaper comes first, then the one of higher quality, then the lower index.
+- Costs are whole numbers.
 - A level whose cost is infinite cannot be had. A level without a promise (NaN) is passed over where its label
-  has others with one. A label without any takes its highest level towards a target; within a budget its
-  levels count as SSIM sqrt(cost / its largest cost), as more is better, but ever less so.
-- A label of weight 0 has no value: within a budget it stays at its cheapest level.
+  has others with one. A label without any takes its highest level.
 """
 
 from collections.abc import Sequence
@@ -18,11 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sagesplat.adapt.knapsack import UNITS, most_within
 from sagesplat.core.errors import RunError
 
 SLACK = 0.01  # least gain of SSIM for a change of level
-STATES = 4096  # partial compositions to keep before a plan is left unproven: half a millisecond
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +23,7 @@ class Allocation:
     """A level per label."""
 
     levels: Int[np.ndarray, "L"]
-    status: str  # "ok"; "infeasible": a label misses the target; "over budget": the smallest does not fit
-    cost: int  # of the composition, in the unit of the costs
-    value: float  # sum of weight x promised SSIM; labels without a promise count as in the module's rules
-    bound: float  # no composition within the budget has more; the bonus for `previous` levels included
-    optimal: bool  # proven: by the module's rules nothing comes before this
+    status: str  # "ok"; "infeasible": a label misses the target
     missed: Bool[np.ndarray, "L"]  # labels with promises of which none reaches the target
 
 
@@ -43,7 +32,6 @@ def cheapest(
     cost: Float[np.ndarray, "L K"] | Int[np.ndarray, "L K"],
     target: float | Float[np.ndarray, "L"],
     *,
-    weight: Float[np.ndarray, "L"] | None = None,
     previous: Int[np.ndarray, "L"] | None = None,
     slack: float = SLACK,
 ) -> Allocation:
@@ -58,7 +46,6 @@ def cheapest(
         quality: [L, K], promised SSIM of each label and level; NaN: no promise.
         cost: [L, K], whole numbers; inf: a level that cannot be had.
         target: SSIM, for all labels or [L].
-        weight: [L], for `value` alone; None: 1 each.
         previous: [L], the levels before, -1: none.
         slack: SSIM.
 
@@ -76,94 +63,29 @@ def cheapest(
         >>> found.levels.tolist(), found.status, found.missed.tolist()
         ([1, 2], 'infeasible', [False, True])
     """
-    quality, cost, weight, previous = _arguments(quality, cost, weight, previous, slack)
+    quality, cost, previous = _arguments(quality, cost, previous, slack)
     q, c, promised = _known(quality, cost)
     target = _targets(target, len(q))
     wanted, met, lower = _reaching(q, c, promised, target, slack)
     levels = _hold(previous, wanted, lower, q, c, promised, met, target, slack)
     missed = promised & ~met
-    total, value = _totals(levels, q, c, weight)
-    return Allocation(levels, "infeasible" if missed.any() else "ok", total, value, value, True, missed)
-
-
-def best_within(
-    quality: Float[np.ndarray, "L K"],
-    cost: Float[np.ndarray, "L K"] | Int[np.ndarray, "L K"],
-    weight: Float[np.ndarray, "L"],
-    budget: float,
-    *,
-    previous: Int[np.ndarray, "L"] | None = None,
-    slack: float = SLACK,
-    states: int = STATES,
-) -> Allocation:
-    """Choose the levels of the largest sum of weight x promised SSIM within a budget.
-
-    A multiple-choice knapsack: Pareto fronts label by label, cut by a Lagrangian bound (Kellerer, Pferschy
-    and Pisinger 2004, ch. 11). Exact if about `states` partial compositions suffice, else no worse than
-    greedy; `optimal` says which. With `previous` levels a label that keeps its level counts as `slack` SSIM
-    better. Promises that stay within slack / 2 of some values then never bring back a composition that was
-    left, as each change gains on those values.
-
-    Args:
-        quality: [L, K], promised SSIM of each label and level; NaN: no promise.
-        cost: [L, K], whole numbers; inf: a level that cannot be had.
-        weight: [L]; a label of weight 0 stays at its cheapest level.
-        budget: In the unit of the costs.
-        previous: [L], the levels before, -1: none.
-        slack: SSIM.
-        states: Partial compositions to keep; 0: greedy alone.
-
-    Returns:
-        A level per label (column of `quality`). Where the smallest composition does not fit: that one, with
-        status "over budget".
-
-    Raises:
-        RunError: For impossible arguments.
-
-    Example:
-        >>> import numpy as np
-        >>> from sagesplat.adapt.allocate import best_within
-        >>> quality, cost = np.array([[0.6, 0.8, 0.9], [0.3, 0.4, 0.5]]), np.array([[1, 4, 9], [2, 3, 4]])
-        >>> found = best_within(quality, cost, np.array([2.0, 1.0]), budget=8)
-        >>> found.levels.tolist(), found.cost, found.optimal
-        ([1, 2], 8, True)
-    """
-    quality, cost, weight, previous = _arguments(quality, cost, weight, previous, slack)
-    budget = _budget(budget)
-    q, c, _ = _known(quality, cost)
-    levels, fits, bound, optimal = most_within(q, c, weight, budget, previous, float(slack), states)
-    total, value = _totals(levels, q, c, weight)
-    status = "ok" if fits else "over budget"
-    bound = max(bound / UNITS * _sum(weight), value)
-    return Allocation(levels, status, total, value, bound, optimal, np.zeros(len(q), bool))
+    return Allocation(levels, "infeasible" if missed.any() else "ok", missed)
 
 
 def along(
     quality: Float[np.ndarray, "P L K"],
     cost: Float[np.ndarray, "L K"] | Int[np.ndarray, "L K"],
+    target: float | Float[np.ndarray, "L"],
     *,
-    target: float | Float[np.ndarray, "L"] | None = None,
-    budget: float | None = None,
-    weight: Float[np.ndarray, "L"] | Float[np.ndarray, "P L"] | None = None,
     slack: float = SLACK,
-    states: int = STATES,
 ) -> Int[np.ndarray, "P L"]:
-    """Levels at each position of a path: `cheapest` or `best_within` after the levels of the position before.
+    """Levels at each position of a path: `cheapest` after the levels of the position before.
 
-    Give `target` or `budget`. Where levels cost more than the budget they are the smallest composition.
     RunError for impossible arguments.
     """
-    if (target is None) == (budget is None):
-        raise RunError("a path is planned for a target or for a budget; give one of them")
-    quality, cost, weight, levels = _arguments(quality, cost, weight, None, slack, path=True)
+    quality, cost, levels = _arguments(quality, cost, None, slack, path=True)
     q, c, promised = _known(quality, cost)
     plan = np.empty(q.shape[:2], np.int64)
-    if budget is not None:
-        budget = _budget(budget)
-        for p in range(len(q)):
-            w = weight if weight.ndim == 1 else weight[p]
-            levels = plan[p] = most_within(q[p], c[p], w, budget, levels, float(slack), states)[0]
-        return plan
     target = _targets(target, q.shape[1])
     wanted, met, lower = _reaching(q, c, promised, target, slack)
     for p in range(len(q)):
@@ -197,11 +119,8 @@ def _known(quality, cost):
     finite = np.isfinite(cost)
     known = finite & ~np.isnan(quality)
     promised = known.any(-1)
-    largest = np.where(finite, cost, 0).max(-1, keepdims=True)
-    assumed = np.sqrt(np.where(finite, cost, 0) / np.maximum(largest, 1))
     usable = np.where(promised[..., None], known, finite)
-    q = np.where(promised[..., None], np.where(known, quality, 0.0), assumed)
-    return q, np.where(usable, cost, np.inf), promised
+    return np.where(known, quality, 0.0), np.where(usable, cost, np.inf), promised
 
 
 def _first(allowed, *keys):
@@ -232,27 +151,13 @@ def _hold(previous, wanted, lower, q, c, promised, met, target, slack):
     return np.where(stays, np.where(down, lower, previous), wanted)
 
 
-def _totals(levels, q, c, weight):
-    """Cost and value of a composition."""
-    rows = np.arange(len(levels))
-    return int(c[rows, levels].sum()), _sum(weight * q[rows, levels])
-
-
-def _sum(parts):
-    """In order, which numpy's own sum is not."""
-    return float(np.cumsum(parts)[-1])
-
-
-def _arguments(quality, cost, weight, previous, slack, path=False):
+def _arguments(quality, cost, previous, slack, path=False):
     """Arguments as arrays of float64 and int64; RunError for what cannot be planned with."""
     quality, cost = np.ascontiguousarray(quality, np.float64), np.ascontiguousarray(cost, np.float64)
     if quality.ndim != 2 + path or not quality.size or cost.shape != quality.shape[-2:]:
         shapes = f"[{'positions, ' * path}labels, levels] and [labels, levels]"
         _refuse(f"quality {quality.shape} and cost {cost.shape} do not fit", f"give {shapes}")
-    weight = np.ones(len(cost)) if weight is None else np.array(weight, np.float64, order="C")
     levels = np.full(len(cost), -1) if previous is None else np.asarray(previous)
-    if weight.shape not in (quality.shape[-2:-1], quality.shape[:-1]):
-        _refuse(f"weight {weight.shape} does not fit quality {quality.shape}", "give one weight per label")
     last = cost.shape[1] - 1
     whole = levels.shape == cost.shape[:1] and levels.dtype.kind in "iu"
     if not whole or levels.min() < -1 or levels.max() > last:
@@ -267,11 +172,9 @@ def _arguments(quality, cost, weight, previous, slack, path=False):
         _refuse("costs add up to 2**53 or more", "give them in a larger unit")
     if not finite.any(-1).all():
         _refuse(f"label {finite.any(-1).argmin()} has no level", "give one a finite cost or drop the label")
-    if weight.min() < 0 or not np.isfinite(weight.sum(-1)).all():
-        _refuse("a weight is negative or not finite", "give 0 for a label that does not matter")
     if not 0 <= slack <= 1:
         _refuse(f"slack {slack} is impossible", "choose a difference of SSIM from 0 to 1, such as 0.01")
-    return quality, cost, weight, np.array(levels, np.int64, order="C")
+    return quality, cost, np.array(levels, np.int64, order="C")
 
 
 def _targets(target, labels):
@@ -279,12 +182,6 @@ def _targets(target, labels):
     if target.shape not in ((), (labels,)) or not ((target > 0) & (target <= 1)).all():
         _refuse(f"target SSIM {target} is impossible", "choose one or one per label, above 0 and at most 1")
     return np.broadcast_to(target, (labels,))
-
-
-def _budget(budget):
-    if not budget > 0:
-        _refuse(f"budget {budget} is impossible", "choose one above 0, in the unit of the costs")
-    return float(np.floor(budget))
 
 
 def _refuse(problem, cure):

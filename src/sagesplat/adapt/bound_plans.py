@@ -8,12 +8,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sagesplat.adapt.allocate import best_within, cheapest
+from sagesplat.adapt.allocate import cheapest
 from sagesplat.adapt.cell_models import Expected, FidelityModel, needed, promised
-from sagesplat.adapt.cell_plans import reach
+from sagesplat.adapt.cell_plans import reach, within
 from sagesplat.adapt.fill import fill
 from sagesplat.adapt.plan import Choice, Plan, Status, check_target
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel, where
+from sagesplat.core.errors import RunError
 from sagesplat.scene.scene import Camera
 
 Unit = Literal["bytes", "gpu-bytes", "count"]
@@ -204,11 +205,10 @@ def plan_within(
 ) -> Plan:
     """Choose the levels of the highest expected quality within a budget.
 
-    The sum over categories of weight x mean quality is maximised: a multiple-choice knapsack
-    (`allocate.best_within`).
+    Of the sum over rows of weight x mean quality the steepest upgrades are taken (`cell_plans.within`).
 
     Args:
-        mean: [L, K], expected quality of each category and level (`pooled`); NaN: unknown.
+        mean: [L, K], expected quality of each row of `costs` and level (`pooled`); NaN: unknown.
         costs: What the levels cost.
         budget: Most that the composition may cost, in `unit`.
         unit: "bytes" to send, "gpu-bytes" on the viewer's GPU, or "count" of Gaussians.
@@ -216,13 +216,19 @@ def plan_within(
         kind: The quality.
 
     Returns:
-        One choice per category. Status "over budget": the smallest composition, where even that does not fit.
+        One choice per row. Status "over budget": the smallest composition, where even that does not fit.
+
+    Raises:
+        RunError: For an impossible budget.
     """
-    found = best_within(mean, costs.of(unit), weight, budget)
+    if not budget > 0:
+        raise RunError(f"budget {budget} is impossible; choose one above 0, in the unit of the costs")
+    cost = costs.of(unit)
+    levels = within(cost, mean, weight, budget)
     statuses = np.where(np.isnan(mean).all(1), "no model", "ok").tolist()
     nowhere = np.full(len(costs.labels), np.nan)
-    choices = make_choices(costs, found.levels, mean, nowhere, statuses)
-    fits = found.status == "ok"
+    choices = make_choices(costs, levels, mean, nowhere, statuses)
+    fits = bool(cost[:, 0].sum() <= budget)
     return Plan(math.nan, None, choices, budget=float(budget), unit=unit, fits=fits, quality=kind)
 
 

@@ -62,9 +62,11 @@ def within(
 ) -> Int[np.ndarray, " C"]:
     """Columns of the levels that a budget in the unit of `cost` allows: the steepest upgrades that still fit.
 
-    All cells begin at their lowest level, whatever that costs; arguments as of `reach`.
+    All cells begin at their lowest level, whatever that costs; arguments as of `reach`. What is unknown
+    counts as sqrt(cost / the cell's largest cost): more is better, but ever less so.
     """
-    value = np.where(share > 0, share, 0.0)[:, None] * np.nan_to_num(mean)
+    assumed = np.sqrt(cost / np.maximum(cost[:, -1:], 1))
+    value = np.where(share > 0, share, 0.0)[:, None] * np.where(np.isnan(mean), assumed, mean)
     levels = np.zeros(len(share), np.int64)
     _within(levels, np.ascontiguousarray(cost, np.float64), value, float(budget))
     return levels

@@ -433,7 +433,7 @@ def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     """From view to view by name at the main target: ours with hysteresis, and the paper's plans."""
     job, costs = nested.job, nested.costs
     target, views = ssim_target(job.run), range(len(job.scene.views))
-    chosen = along(nested.qualities["ssim"].bound, costs.transfer_bytes, target=target) + 1
+    chosen = along(nested.qualities["ssim"].bound, costs.transfer_bytes, target) + 1
     ours = [dict(zip(costs.labels, levels.tolist(), strict=True)) for levels in chosen]
     increments = increments_of(job)
     label_of = job.cells.label_of
