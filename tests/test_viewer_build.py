@@ -1,5 +1,6 @@
 """The viewer's own checks; that its build in the package is current; its npm package."""
 
+import gzip
 import json
 import os
 import re
@@ -50,6 +51,15 @@ def npm() -> Npm:
 def test_types_format_and_unit_tests(npm: Npm) -> None:
     checked = npm("run", "check")
     assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+def test_little_code_comes_before_the_first_picture() -> None:
+    """Gzip as servers send it; the WebAssembly, which SPZ, PLY and very many splats need, is another file."""
+    page = (STATIC / "index.html").read_text("utf-8")
+    asked = re.findall(r'(?:src|href)="\./(assets/[^"]+)"', page)
+    assert len(asked) == 2
+    assert sum(len(gzip.compress((STATIC / name).read_bytes())) for name in asked) < 300_000
+    assert not any(name.endswith(".wasm") for name in asked)
 
 
 def test_the_built_viewer_is_current(npm: Npm, tmp_path: Path) -> None:

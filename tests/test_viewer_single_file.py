@@ -43,6 +43,7 @@ def viewer(tmp_path: Path) -> Path:
     (folder / "index.html").write_text(PAGE)
     (folder / "assets" / "index-1.js").write_text(SCRIPT)
     (folder / "assets" / "index-2.css").write_text("a { color: red }")
+    (folder / "assets" / "spark-1.wasm").write_bytes(b"\0asm")
     (folder / "THIRD_PARTY_LICENSES.txt").write_text("MIT")
     return folder
 
@@ -72,6 +73,7 @@ def test_everything_is_in_the_page(tmp_path, viewer, contents) -> None:
     manifest = json.loads(files.pop("manifest.json"))
     assert manifest["pack"] is None
     assert (files.pop("THIRD_PARTY_LICENSES.txt"), b"Apache" in files.pop("LICENSES.txt")) == (b"MIT", True)
+    assert files.pop("assets/spark.wasm") == b"\0asm"  # there are levels in SPZ
     levels = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
     assert [hashlib.sha256(files[level["uri"]]).hexdigest() for level in levels] == [
         level["sha256"] for level in levels

@@ -1,11 +1,12 @@
 import { defineConfig } from "vitest/config";
 import { licenses } from "./licenses.ts";
 import { schema } from "./schema.ts";
+import { spark } from "./spark.ts";
 
 /** The page of a bundle, which the Python package brings. */
 export default defineConfig({
   base: "./",
-  plugins: [schema(), licenses()],
+  plugins: [spark(), schema(), licenses()],
   build: {
     outDir: "../src/sagesplat/viewer/static",
     emptyOutDir: true,

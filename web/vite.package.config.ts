@@ -4,6 +4,7 @@ import { join } from "node:path";
 import { defineConfig, type Plugin } from "vite";
 import { licenses } from "./licenses.ts";
 import { schema } from "./schema.ts";
+import { spark } from "./spark.ts";
 
 function ownLicense(): Plugin {
   const source = readFileSync(join(import.meta.dirname, "..", "LICENSE"), "utf8");
@@ -17,7 +18,7 @@ function ownLicense(): Plugin {
 
 /** The npm package: one module that brings all that it needs. */
 export default defineConfig({
-  plugins: [schema(), licenses(), ownLicense()],
+  plugins: [spark(true), schema(), licenses(), ownLicense()],
   build: {
     outDir: "dist",
     target: "es2022",

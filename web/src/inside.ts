@@ -28,6 +28,14 @@ export function sourceInside(page: ParentNode): Source | null {
   };
 }
 
+/** A file of a source as a whole, which the page has inside. */
+export async function bytesFrom(source: Source, uri: string): Promise<ArrayBuffer> {
+  const reply = await source.fetch(new URL(uri, source.base).href);
+  const { value } = (await reply.body?.getReader().read()) ?? {};
+  if (!value) throw new Error(`${uri} is not in this page; write it again.`);
+  return new Uint8Array(value).buffer;
+}
+
 const MISSING: Reply = {
   ok: false,
   status: 404,

@@ -1,12 +1,13 @@
 import { inAdvance } from "./core/advance";
 import type { Fetch } from "./core/download";
 import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
-import { type Source, sourceInside } from "./inside";
+import { bytesFrom, type Source, sourceInside } from "./inside";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
 import { colorsOf } from "./view/colors";
 import { openViewer } from "./view/open";
 import { embed, type Viewer } from "./view/viewer";
+import { readFrom } from "./view/wasm";
 
 declare global {
   interface Window {
@@ -25,8 +26,10 @@ async function begin(): Promise<void> {
   const app = document.getElementById("app");
   if (!app) throw new Error("This page is incomplete; copy the bundle again.");
   const inside = sourceInside(document);
-  if (inside) await show(app, inside, options);
-  else await showOnline(app, options);
+  if (inside) {
+    readFrom(() => bytesFrom(inside, "assets/spark.wasm"));
+    await show(app, inside, options);
+  } else await showOnline(app, options);
 }
 
 /** Shows a bundle of a server. The pack that the page names is asked for together with the manifest. */

@@ -51,6 +51,8 @@ def write_single_file(
     named = {manifest["promises"][quality]["uri"]: content for quality, content in promises.items()}
     text = dumped(manifest)
     small = {MANIFEST: text, "LICENSES.txt": LICENSES.encode(), **named}
+    if any(chunk.format != "stream" for chunk in contents.chunks):
+        small["assets/spark.wasm"] = _decoder(viewer)
     if (viewer / THIRD_PARTY).exists():
         small[THIRD_PARTY] = (viewer / THIRD_PARTY).read_bytes()
     before, after = _page(viewer, poster)
@@ -65,6 +67,14 @@ def write_single_file(
     except OSError as error:
         raise RunError(unwritable(out, error)) from error
     return BundleSizes(len(text), sum(map(len, promises.values())), chunks, out.stat().st_size)
+
+
+def _decoder(viewer: Path) -> bytes:
+    """What decodes other formats than streams. SageError for a viewer of another layout."""
+    found = next((viewer / "assets").glob("spark-*.wasm"), None)
+    if found is None:
+        raise SageError(f"{viewer}: not a viewer that fits into a page; run `make web` again")
+    return found.read_bytes()
 
 
 def check_page(out: Path) -> None:
