@@ -673,12 +673,55 @@ def test_what_cannot_be_shown_is_said(
 
 
 @pytest.mark.slow
-def test_a_lost_context_is_said(site: str, browser: Any) -> None:
+def test_a_lost_context_is_said_and_comes_back_where_one_was(site: str, browser: Any) -> None:
     with open_page(site, browser=browser) as opened:
         ready(opened)
-        lose = "document.getElementById('view').getContext('webgl2').getExtension('WEBGL_lose_context')"
-        opened.page.evaluate(f"{lose}.loseContext()")
+        opened.page.evaluate("sagesplat.goTo(1)")
+        opened.page.evaluate("sagesplat.set({ target: 0.87 })")
+        settled(opened)
+        pose = opened.page.evaluate("sagesplat.pose().position")
+        opened.page.evaluate(
+            "window.lost = document.getElementById('view').getContext('webgl2')"
+            ".getExtension('WEBGL_lose_context'); lost.loseContext()"
+        )
         assert "GPU context was lost" in message(opened)
+        opened.page.evaluate("lost.restoreContext()")
+        opened.wait_for("window.lost === undefined && sagesplat.state !== undefined")
+        assert opened.page.evaluate("sagesplat.pose().position") == pytest.approx(pose, abs=1e-4)
+        assert opened.page.evaluate("sagesplat.settings().target") == 0.87
+        settled(opened)
+
+
+@pytest.mark.slow
+def test_side_by_side_may_be_left_while_it_loads(site: str, browser: Any) -> None:
+    with open_page(site, browser=browser) as opened:
+        ready(opened)
+        for _ in range(6):
+            opened.page.keyboard.press("c")
+            opened.page.evaluate(FRAMES, 2)
+        settled(opened)
+        assert opened.complaints == []
+
+
+@pytest.mark.slow
+def test_a_budget_begins_with_what_is_loaded_and_a_link_keeps_it(site: str, browser: Any) -> None:
+    with open_page(site, browser=browser) as opened:
+        ready(opened)
+        opened.page.evaluate("sagesplat.set({ mode: 'base' })")
+        opened.wait_for(f"sagesplat.state().count === {BASE}")
+        shown = opened.page.evaluate("sagesplat.state().bytesShown")
+        opened.page.evaluate("document.querySelector('[data-mode=budget]').click()")
+        assert opened.page.evaluate("sagesplat.settings().budget.bytes") == shown
+        opened.page.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text }")
+        opened.page.evaluate("document.querySelector('.sharing button').click()")
+        link = opened.wait_for("window.copied")
+        assert f"budget={shown / 1e6}" in link
+        pose = opened.page.evaluate("sagesplat.pose().position")
+        opened.page.goto(link)
+        ready(opened)
+        assert opened.page.evaluate("sagesplat.settings().budget.bytes") == pytest.approx(shown)
+        assert opened.page.evaluate("sagesplat.pose().position") == pytest.approx(pose, abs=1e-4)
+        assert opened.complaints == []
 
 
 # cells

@@ -39,7 +39,7 @@ export async function createViewer(element: HTMLElement, options: ViewerOptions)
   const base = new URL(bundle, document.baseURI);
   if (!base.pathname.endsWith("/")) base.pathname += "/";
   const source = { base, fetch: (url: string, init?: RequestInit) => fetch(url, init) };
-  const shown = { view, quality, target, budget, ui: false, bundle: "", edit: null };
+  const shown = { view, pose: null, quality, target, budget, ui: false, bundle: "", edit: null };
   const viewer = await openViewer(element, source, shown);
   if (onLost) viewer.onLost(onLost);
   viewer.start();

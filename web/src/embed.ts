@@ -32,6 +32,7 @@ export interface Embed {
 /** The options in the page's address. */
 export interface Options {
   readonly view: string | null;
+  readonly pose: Pose | null;
   readonly quality: Quality | null; // that the target is of; null: the bundle's
   readonly target: number | null;
   readonly budget: number | null; // MB
@@ -40,11 +41,15 @@ export interface Options {
   readonly edit: string | null; // what the server takes edits of labels with
 }
 
-/** Reads `?view=NAME&quality=ssim&target=0.7&budget=MB&ui=0&bundle=path/`, from the query and the fragment. Throws. */
+/**
+ * Reads `?view=NAME&pose=X,Y,Z,QX,QY,QZ,QW&quality=ssim&target=0.7&budget=MB&ui=0&bundle=path/`, from the query and
+ * the fragment. Throws.
+ */
 export function parseOptions(search: string, hash: string): Options {
   const given = new URLSearchParams(`${search.replace(/^\?/, "")}&${hash.replace(/^#/, "")}`);
   return {
     view: given.get("view"),
+    pose: poseOf(given.get("pose")),
     quality: qualityOf(given.get("quality")),
     target: numeric(given, "target", 0, 1),
     budget: numeric(given, "budget", 0, 1e6),
@@ -52,6 +57,34 @@ export function parseOptions(search: string, hash: string): Options {
     bundle: bundlePath(given.get("bundle") ?? ""),
     edit: given.get("edit"),
   };
+}
+
+function poseOf(text: string | null): Pose | null {
+  if (text === null) return null;
+  const numbers = text.split(",").map((part) => (part.trim() === "" ? Number.NaN : Number(part)));
+  const [x = 0, y = 0, z = 0, qx = 0, qy = 0, qz = 0, qw = 0] = numbers;
+  if (numbers.length !== 7 || !numbers.every(Number.isFinite) || !Math.hypot(qx, qy, qz, qw)) {
+    throw new Error(`?pose=${text} is not seven numbers, of a place and a quaternion; correct the address.`);
+  }
+  return { position: [x, y, z], quaternion: [qx, qy, qz, qw] };
+}
+
+/** The address of a page that shows the same: its pose, and what is asked of it. */
+export function linkTo(page: string, { position, quaternion }: Pose, settings: Settings): string {
+  const url = new URL(page);
+  const given = new URLSearchParams(`${url.search.slice(1)}&${url.hash.slice(1)}`);
+  for (const name of ["view", "pose", "quality", "target", "budget", "edit"]) given.delete(name);
+  given.set("pose", [...position, ...quaternion].map((value) => Number(value.toPrecision(6))).join());
+  const { mode, quality, target, budget } = settings;
+  if (mode === "target") {
+    given.set("quality", quality);
+    given.set("target", String(target));
+  } else if (mode === "budget" && budget.bytes < Infinity) {
+    given.set("budget", String(budget.bytes / 1e6));
+  }
+  url.search = given.toString().replaceAll("%2C", ",");
+  url.hash = "";
+  return url.href;
 }
 
 function qualityOf(text: string | null): Quality | null {

@@ -1,6 +1,6 @@
 import { inAdvance } from "./core/advance";
 import type { Fetch } from "./core/download";
-import { bundleUrl, type Embed, type Options, parseOptions } from "./embed";
+import { bundleUrl, type Embed, linkTo, type Options, parseOptions } from "./embed";
 import { bytesFrom, type Source, sourceInside } from "./inside";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
@@ -55,9 +55,14 @@ async function show(app: HTMLElement, source: Source, options: Options): Promise
   hideNotice();
   if (options.ui) buildPage(app, viewer);
   window.sagesplat = Object.assign(window.sagesplat, embed(viewer));
-  viewer.onLost(() => {
-    fail("The GPU context was lost, usually for lack of memory; reload the page with a smaller budget.");
-  });
+  let here = location.href;
+  viewer.onLost(
+    () => {
+      here = linkTo(location.href, viewer.pose(), viewer.settings);
+      fail("The GPU context was lost, usually for lack of memory; reload the page with a smaller budget.");
+    },
+    () => location.replace(here), // Spark's textures do not come back
+  );
   followTraining(viewer);
   viewer.start();
   removePosterWhenDrawn(viewer, canvas);

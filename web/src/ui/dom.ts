@@ -72,6 +72,9 @@ export function iconButton(
   );
 }
 
+/** Whether fingers are the main pointer. */
+export const isTouch = (): boolean => matchMedia("(pointer: coarse)").matches;
+
 /** Sets text only if it changed, to avoid a new layout. */
 export function setText(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;

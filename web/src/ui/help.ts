@@ -1,9 +1,14 @@
-import { h, textButton } from "./dom";
+import { h, isTouch, textButton } from "./dom";
 
+const TOUCH: readonly (readonly [string, string])[] = [
+  ["Drag", "orbit the scene, or look around in walk mode"],
+  ["Two fingers", "move sideways"],
+  ["Pinch", "move closer or farther"],
+];
 const HELP: readonly (readonly [string, string])[] = [
   ["Drag", "orbit the scene, or look around in walk mode"],
-  ["Right drag, two fingers", "move sideways"],
-  ["Wheel, pinch", "move closer or farther"],
+  ["Right drag", "move sideways"],
+  ["Wheel", "move closer or farther"],
   ["W A S D", "move; Q and E down and up, Shift faster"],
   ["Arrow keys", "turn"],
   ["O", "orbit or walk"],
@@ -19,7 +24,7 @@ const HELP: readonly (readonly [string, string])[] = [
 
 /** The help dialog; Escape closes it. */
 export function helpDialog(): HTMLDialogElement {
-  const rows = HELP.flatMap(([key, text]) => [h("dt", {}, key), h("dd", {}, text)]);
+  const rows = (isTouch() ? TOUCH : HELP).flatMap(([key, text]) => [h("dt", {}, key), h("dd", {}, text)]);
   const close = textButton("Close", "primary", () => dialog.close());
   const note = h(
     "p",

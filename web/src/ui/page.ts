@@ -52,7 +52,9 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
     bar.style.setProperty("--value", String(wanted ? shown / wanted : 0));
     bar.setAttribute("aria-valuenow", String(Math.round((100 * shown) / Math.max(wanted, 1))));
     status.classList.toggle("warn", Boolean(state.message || state.status === "over budget"));
-    setText(status, said ?? state.message ?? sentence(viewer, done));
+    const isOffline = !navigator.onLine && (state.pending > 0 || state.message !== null);
+    const offline = isOffline ? "You are offline; loading goes on with the connection" : null;
+    setText(status, said ?? offline ?? state.message ?? sentence(viewer, done));
     status.title = state.message ?? "";
     panel.update();
     tools.update();

@@ -1,9 +1,10 @@
 import { leastPromise } from "../core/describe";
 import { qualitiesOf } from "../core/manifest";
+import { linkTo } from "../embed";
 import type { Quality, Settings } from "../types";
 import { isTyping } from "../view/controls";
 import { DEFAULT_TARGETS, type Viewer } from "../view/viewer";
-import { h, iconButton, setText } from "./dom";
+import { h, iconButton, setText, textButton } from "./dom";
 import { formatBytes, formatCount, formatScreens, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
 
@@ -30,7 +31,7 @@ export class Panel {
     this.#modes = MODES.map(([mode, title]) =>
       h(
         "button",
-        { type: "button", role: "radio", "data-mode": mode, click: () => viewer.set({ mode }) },
+        { type: "button", role: "radio", "data-mode": mode, click: () => setMode(viewer, mode) },
         title,
       ),
     );
@@ -61,6 +62,7 @@ export class Panel {
         this.#screens,
         this.#facts,
         this.#table.element,
+        sharing(viewer),
       ),
     );
     if (matchMedia(NARROW).matches) this.element.classList.add("closed");
@@ -128,6 +130,44 @@ export class Panel {
     this.element.querySelector(".head button")?.setAttribute("aria-expanded", String(open));
     this.element.querySelector(".body")?.toggleAttribute("inert", !open);
   }
+}
+
+/** A budget without limits begins with what is loaded: to look at it costs nothing. */
+function setMode(viewer: Viewer, mode: Settings["mode"]): void {
+  const { settings, state } = viewer;
+  const isOpen = Object.values(settings.budget).every((limit) => limit === Infinity);
+  const budget = { ...settings.budget, bytes: state.bytesShown };
+  viewer.set(mode === "budget" && isOpen && state.bytesShown > 0 ? { mode, budget } : { mode });
+}
+
+/** A link to this view, a picture of it, the whole screen. */
+function sharing(viewer: Viewer): HTMLElement {
+  const { canvas } = viewer.stage;
+  const link = textButton("Copy link", "text", () => {
+    const href = linkTo(location.href, viewer.pose(), viewer.settings);
+    navigator.clipboard?.writeText(href).then(
+      () => setText(link, "Link copied"),
+      () => location.replace(href), // where a page may not write: the address is the link
+    );
+    setTimeout(() => setText(link, "Copy link"), 3000);
+  });
+  const picture = textButton("Save picture", "text", () => {
+    const stop = viewer.onSample(() => {
+      stop();
+      canvas.toBlob((blob) => {
+        if (!blob) return;
+        const url = URL.createObjectURL(blob);
+        h("a", { href: url, download: `${viewer.manifest.name}.png` }).click();
+        setTimeout(() => URL.revokeObjectURL(url), 1000);
+      });
+    });
+  });
+  const whole = textButton("Full screen", "text", () => {
+    if (document.fullscreenElement) void document.exitFullscreen();
+    else void document.documentElement.requestFullscreen();
+  });
+  const can = document.fullscreenEnabled ? [whole] : [];
+  return h("div", { class: "sharing" }, link, picture, ...can);
 }
 
 const rate = (bytes: number) => (Number.isFinite(bytes) ? ` · ${formatBytes(bytes)}/s` : "");

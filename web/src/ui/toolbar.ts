@@ -1,7 +1,8 @@
+import { qualitiesOf } from "../core/manifest";
 import { isTyping } from "../view/controls";
 import type { Viewer } from "../view/viewer";
 import { offered, type XrMode } from "../view/xr";
-import { h, iconButton, setIcon, textButton } from "./dom";
+import { h, iconButton, isTouch, setIcon, textButton } from "./dom";
 import type { EditorCard } from "./editor";
 import { messageOf } from "./notice";
 import type { Split } from "./split";
@@ -25,7 +26,9 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
     viewer.controls.mode = viewer.controls.mode === "orbit" ? "walk" : "orbit";
     setIcon(mode, viewer.controls.mode);
     parts.say(
-      viewer.controls.mode === "orbit" ? "Drag to orbit the scene" : "Drag to look around, W A S D to walk",
+      viewer.controls.mode === "orbit"
+        ? "Drag to orbit the scene"
+        : `Drag to look around, ${isTouch() ? "pinch" : "W A S D"} to walk`,
     );
   });
   const compare = iconButton("compare", "Compare with the full scene (C)", () => parts.split.toggle());
@@ -68,13 +71,16 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
 
 function photoPicker(viewer: Viewer): { elements: HTMLElement[]; step(by: number): void; update(): void } {
   const { cameras } = viewer.manifest;
-  const go = (index: number) => viewer.goTo((index + cameras.length) % cameras.length, true);
+  const go = (index: number) => {
+    const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    viewer.goTo((index + cameras.length) % cameras.length, !still);
+  };
   const step = (by: number) => cameras.length && go(viewer.photo < 0 ? (by > 0 ? 0 : -1) : viewer.photo + by);
   const options = cameras.map(({ name }, i) => h("option", { value: i }, name));
   const select = h(
     "select",
     { "aria-label": "Photo position", change: () => select.value !== "-1" && go(Number(select.value)) },
-    h("option", { value: -1 }, "Photos"),
+    h("option", { value: -1 }, qualitiesOf(viewer.manifest).includes("ssim") ? "Photos" : "Viewpoints"),
     ...options,
   );
   return {

@@ -1,4 +1,4 @@
-import { h, textButton } from "./dom";
+import { h, isTouch, textButton } from "./dom";
 import { remember, remembered } from "./storage";
 
 const KEY = "sagesplat-welcome";
@@ -9,7 +9,7 @@ const WHAT = "Each part of the scene loads only as finely as it needs to; the sl
 /** Two lines for newcomers; gone at the first touch of the scene, and not shown again. */
 export function welcome(canvas: HTMLElement): HTMLElement | null {
   if (remembered(KEY) !== null) return null;
-  const how = matchMedia("(pointer: coarse)").matches ? TOUCH : MOUSE;
+  const how = isTouch() ? TOUCH : MOUSE;
   const close = textButton("Got it", "primary", () => done());
   const element = h("div", { class: "welcome" }, h("p", {}, h("b", {}, how)), h("p", {}, WHAT), close);
   const done = () => {

@@ -240,7 +240,9 @@ export class SparkLayer implements Renderer {
     }
     this.#columns.clear();
     this.#decoders.close();
-    this.spark.dispose();
+    this.spark.sortDirty = false; // no other sort begins, and one that has begun needs what is freed here
+    const end = () => (this.spark.sorting ? setTimeout(end, 50) : this.spark.dispose());
+    end();
   }
 
   #column(label: number, cell: number): Column {

@@ -72,6 +72,7 @@ export class Viewer {
     const hidden = manifest.labels.flatMap((label) => (label.hidden ? [label.id] : []));
     if (hidden.length) this.setHidden(hidden, true);
     if (options.view !== null) this.goTo(options.view);
+    if (options.pose) this.setPose(options.pose);
   }
 
   start(): void {
@@ -101,10 +102,11 @@ export class Viewer {
     this.stage.canvas.remove();
   }
 
-  /** Calls back when the browser takes the GPU away, usually for lack of memory. */
-  onLost(callback: () => void): void {
+  /** Calls back when the browser takes the GPU away, usually for lack of memory; and when it gives it back. */
+  onLost(callback: () => void, restored?: () => void): void {
     const { signal } = this.#life;
     this.stage.canvas.addEventListener("webglcontextlost", callback, { signal });
+    if (restored) this.stage.canvas.addEventListener("webglcontextrestored", restored, { signal });
   }
 
   get state(): State {

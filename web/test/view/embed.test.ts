@@ -1,5 +1,6 @@
 import { expect, test } from "vitest";
-import { bundleUrl, parseOptions } from "../../src/embed";
+import { bundleUrl, linkTo, parseOptions } from "../../src/embed";
+import type { Settings } from "../../src/types";
 import { formatBytes, formatCount, formatDistance, formatSsim } from "../../src/ui/format";
 import { dead } from "../../src/view/controls";
 
@@ -7,6 +8,7 @@ test("options come from the query and the fragment", () => {
   const options = parseOptions("?target=0.8&ui=0", "#view=a b.jpg&budget=1.5");
   expect(options).toEqual({
     view: "a b.jpg",
+    pose: null,
     quality: null,
     target: 0.8,
     budget: 1.5,
@@ -17,6 +19,31 @@ test("options come from the query and the fragment", () => {
   expect(parseOptions("", "").ui).toBe(true);
   expect(parseOptions("?quality=ssim&target=0.7", "")).toMatchObject({ quality: "ssim", target: 0.7 });
   expect(() => parseOptions("?quality=psnr", "")).toThrow("?quality=psnr is not one of fidelity, ssim");
+});
+
+test("a link shows the same again", () => {
+  const pose = { position: [1, -2.5, 1 / 3], quaternion: [0, 0.6, 0, 0.8], fovY: 1 } as const;
+  const unlimited = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
+  const settings = { mode: "target", quality: "fidelity", target: 0.85, budget: unlimited } as Settings;
+  const page = "https://a.b/c/?bundle=garden/&view=old.jpg&edit=secret#target=0.5&ui=0";
+  const link = linkTo(page, pose, settings);
+  expect(link).toBe(
+    "https://a.b/c/?bundle=garden%2F&ui=0&pose=1,-2.5,0.333333,0,0.6,0,0.8&quality=fidelity&target=0.85",
+  );
+  const { search, hash } = new URL(link);
+  expect(parseOptions(search, hash)).toMatchObject({
+    view: null,
+    pose: { position: [1, -2.5, 0.333333], quaternion: [0, 0.6, 0, 0.8] },
+    target: 0.85,
+    bundle: "garden/",
+    ui: false,
+    edit: null,
+  });
+  const budget = linkTo(page, pose, { ...settings, mode: "budget", budget: { ...unlimited, bytes: 2.5e5 } });
+  expect(parseOptions(new URL(budget).search, "")).toMatchObject({ budget: 0.25, target: null });
+  for (const bad of ["1,2,3", "1,2,3,0,0,0,0", "a,2,3,0,0,0,1", ",,,,,,", "1,2,3,0,0,0,1,1"]) {
+    expect(() => parseOptions(`?pose=${bad}`, "")).toThrow("is not seven numbers");
+  }
 });
 
 test.each([
