@@ -94,7 +94,7 @@ def test_levels_end_with_what_came_in(adopted: Path) -> None:
     for label, count in before.counts().items():
         assert top.counts()[label] == count
         mine, theirs = (np.sort(g.of_labels([label]).means[:, 0].numpy()) for g in (top, before))
-        np.testing.assert_allclose(mine, theirs, atol=0.01)  # SPZ's steps
+        np.testing.assert_allclose(mine, theirs, atol=0.01)  # steps of streams
 
 
 def test_fidelity_is_against_what_came_in(adopted: Path) -> None:
@@ -162,7 +162,7 @@ def test_lossless_is_identical(tmp_path: Path, fit: Any) -> None:
     said = [line for e in events if isinstance(e, StageDone) and e.name == "nest" for line in e.lines]
     assert any("as it came in" in line for line in said)
     kinds = {one.level: one.format for one in read_index(job.run.increments)}
-    assert (kinds[4], kinds[1]) == ("ply", "spz")
+    assert (kinds[4], kinds[1]) == ("ply", "stream")
 
 
 @pytest.mark.slow
