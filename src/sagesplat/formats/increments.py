@@ -17,7 +17,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Int64
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
@@ -25,7 +24,7 @@ from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import put_ply, read_ply
-from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, position_step, read_spz
+from sagesplat.formats.spz import SH_BITS, encode_spz, position_step, read_spz
 from sagesplat.formats.stream import Decoded, decode_stream, starts_of_streams
 from sagesplat.io.files import atomic_folder, write_json
 from sagesplat.io.typed import read_json_as
@@ -68,12 +67,6 @@ class Increment:
     def format(self) -> Format:
         """Of the file, by its name."""
         return _FORMATS.get(Path(self.uri).suffix, "spz")
-
-
-def packed(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> Int64[np.ndarray, " N"]:
-    """Rows sorted by cell and level, and within a level, where any order is valid, by `packing_order`."""
-    rows = [part[packing_order(g.select(torch.from_numpy(part)))] for _, _, part in increments(g, sizes)]
-    return np.concatenate([*rows, np.arange(0)])
 
 
 def increments(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> list[tuple[int, int, np.ndarray]]:
