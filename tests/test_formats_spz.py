@@ -30,7 +30,6 @@ from sagesplat.formats.spz import (
     MAX_COUNT,
     decode_spz,
     encode_spz,
-    packing_order,
     read_spz,
     read_spz_splat,
     write_spz,
@@ -243,14 +242,6 @@ def test_positions_take_the_bits_that_fit():
         encode_spz(one(means=[1e8, 0, 0]), name="a.spz")
     with pytest.raises(DataError, match="positions up to 5 allow 0 to 20"):
         encode_spz(one(means=[5.0, 0, 0]), fractional_bits=21)
-
-
-def test_the_packing_order_is_an_order_that_packs():
-    g = random_gaussians(4000)
-    order = torch.from_numpy(packing_order(g))
-    assert torch.equal(order.sort().values, torch.arange(4000))
-    assert len(encode_spz(g.select(order))) < len(encode_spz(g))
-    assert len(packing_order(random_gaussians(0))) == 0
 
 
 @pytest.mark.parametrize("key", PARAMETERS)

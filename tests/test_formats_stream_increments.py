@@ -5,6 +5,7 @@ import json
 from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
 from sagesplat.formats.increments import Increment, full_scene, read_increments, read_index, shown, totals
+from sagesplat.formats.stream_header import AS_GIVEN
 from sagesplat.formats.stream_increments import Streams, read_streams, write_streams
 from sagesplat.io.typed import convert_as
 
@@ -194,3 +196,102 @@ def test_impossible_entries(wrong):
     assert convert_as(asdict(good), Increment) == good
     with pytest.raises(ValueError, match=r"offset|weight"):
         convert_as({**asdict(good), **wrong}, Increment)
+
+
+REPLACED = {0: (3,), 2: (2, 5)}  # by cell; the sky's levels add up
+
+
+def replacing(folder: Path, **more: Any) -> tuple[Gaussians, Streams]:
+    """A ladder of which some levels replace those below, and how it is written."""
+    g, _ = some()
+    sizes = {0: (3, 3, 10, 20, 20), 2: (1, 4, 6, 6, 15), 5: (1, 2, 2, 2, 2)}
+    labels = {0: 7, 2: 7, 5: 9}
+    return g, write_streams(
+        folder, g, sizes, {7: "grass", 9: "sky"}, label_of=labels, replaces=REPLACED, **more
+    )
+
+
+def test_a_set_that_replaces_is_a_stream_of_its_own(tmp_path):
+    g, made = replacing(tmp_path)
+    assert read_index(tmp_path) == made.increments
+    assert [(one.cell, one.level) for one in made.increments if one.refine == "REPLACE"] == [
+        (0, 3), (2, 2), (2, 5),
+    ]  # fmt: skip
+    grass, sky = ([one for one in made.increments if one.label_id == label] for label in (7, 9))
+    assert len({one.uri for one in grass}) == len({one.uri for one in sky}) == 1
+    by_place = sorted(grass, key=lambda one: one.offset)  # the lowest sets of all cells come first
+    assert [(one.cell, one.level) for one in by_place] == [
+        (0, 1),
+        (2, 1),
+        (0, 3),
+        (0, 4),
+        (2, 2),
+        (2, 3),
+        (2, 5),
+    ]
+    content, ends = (tmp_path / grass[0].uri).read_bytes(), [one.offset + one.nbytes for one in by_place]
+    assert [one.offset for one in by_place] == [0, *ends[:-1]]
+    assert ends[-1] == len(content)
+    everything, rows = read_increments(tmp_path, made.increments), torch.from_numpy(made.rows)
+    assert torch.equal(everything.label_ids, g.label_ids[rows])
+    assert (everything.means - g.means[rows]).abs().max() < 0.05
+    ends = {cell: [0, *sizes] for cell, sizes in made.sizes.items()}
+    counts = totals(made.increments, list(made.sizes), 5, "count")
+    for row, cell in enumerate(made.sizes):
+        mine = everything.of_labels([cell])
+        for level in range(1, 6):
+            found = read_increments(tmp_path, shown(made.increments, cell, level))
+            first = max([0, *(ends[cell][k - 1] for k in REPLACED.get(cell, ()) if k <= level)])
+            assert torch.equal(found.means, mine.means[first : ends[cell][level]])
+            assert len(found) == counts[row, level - 1]
+    last = read_increments(tmp_path, [one for one in made.increments if (one.cell, one.level) == (0, 4)])
+    assert len(last) == 10  # of a stream that begins at level 3
+
+
+def test_of_a_set_that_is_hardly_to_be_seen_one_gaussian_stays(tmp_path):
+    g, _ = some()
+    g.logit_opacities[3:10] = -9.0
+    sizes = {0: (3, 10, 20)}
+    grass = g.of_labels([0])
+    made = write_streams(tmp_path, grass, sizes, {}, label_of={0: 0}, replaces={0: (2, 3)})
+    assert made.sizes == {0: (2, 3, 13)}  # one of the first level was not to be seen before
+    assert len(read_increments(tmp_path, shown(made.increments, 0, 2))) == 1
+
+
+def test_the_last_set_is_kept_as_finely_as_asked(tmp_path):
+    g, made = replacing(tmp_path / "exact", last=None)
+    kinds = {(one.cell, one.level): one.format for one in made.increments}
+    assert kinds == {
+        (0, 1): "stream", (0, 3): "ply", (0, 4): "ply", (2, 1): "stream", (2, 2): "stream",
+        (2, 3): "stream", (2, 5): "ply", (5, 1): "ply", (5, 2): "ply",
+    }  # fmt: skip
+    found = read_increments(tmp_path / "exact", shown(made.increments, 0, 5))
+    assert torch.equal(found.means, g.means[3:20])
+    assert torch.equal(found.shN, g.shN[3:20])
+    assert len(read_increments(tmp_path / "exact", shown(made.increments, 2, 4))) == 5
+    off = []
+    for name, precision in (("coarse", AS_GIVEN[0]), ("fine", AS_GIVEN[-1])):
+        g, made = replacing(tmp_path / name, last=precision)
+        top = read_increments(tmp_path / name, shown(made.increments, 2, 5))
+        mine = torch.from_numpy(made.rows[(made.rows >= 26) & (made.rows < 35)])
+        off.append(float((top.shN - g.shN[mine]).abs().mean()))
+    assert off[1] < off[0] / 2
+
+
+def test_what_lies_far_off_makes_files_of_a_set(tmp_path):
+    g, _ = some()
+    g.means[19] = 1e7
+    made = write_streams(
+        tmp_path, g.of_labels([0]), {0: (3, 10, 20)}, {}, label_of={0: 0}, replaces={0: (2, 3)}
+    )
+    assert [one.format for one in made.increments] == ["stream", "stream", "ply"]
+    assert torch.equal(read_increments(tmp_path, made.increments[-1:]).means, g.means[10:20])
+
+
+def test_levels_that_cannot_replace_are_refused(tmp_path):
+    g, _ = some()
+    for levels in ((1,), (2,), (4,)):
+        with pytest.raises(ValueError, match="cannot replace"):
+            write_streams(
+                tmp_path, g.of_labels([0]), {0: (3, 3, 20)}, {}, label_of={0: 0}, replaces={0: levels}
+            )

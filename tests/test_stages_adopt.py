@@ -94,7 +94,7 @@ def test_levels_end_with_what_came_in(adopted: Path) -> None:
     for label, count in before.counts().items():
         assert top.counts()[label] == count
         mine, theirs = (np.sort(g.of_labels([label]).means[:, 0].numpy()) for g in (top, before))
-        np.testing.assert_allclose(mine, theirs, atol=0.01)  # SPZ's steps
+        np.testing.assert_allclose(mine, theirs, atol=0.01)  # steps of streams
 
 
 def test_fidelity_is_against_what_came_in(adopted: Path) -> None:
@@ -147,6 +147,25 @@ def test_a_second_call_does_nothing(adopted: Path) -> None:
     assert not [event for event in events if isinstance(event, StageDone)]
 
 
+def test_levels_that_were_made_as_spz_files_are_made_again_with_force(adopted: Path) -> None:
+    record = RunDir(adopted).provenance("nest")
+    before = record.read_text()
+    old = json.loads(before)
+    del old["settings"]["increments"]
+    record.write_text(json.dumps(old))
+    job = Job(RunDir(adopted), lambda event: None, "cpu")
+    with pytest.raises(RunError, match=r"ladder\.npz: made with other .*increments.*--force"):
+        make_levels(job, SMALL)
+    record.write_text(before)
+
+
+def test_levels_are_a_file_of_streams_for_each_category(adopted: Path) -> None:
+    listed = read_index(RunDir(adopted).increments)
+    assert {one.format for one in listed} == {"stream"}
+    assert len({one.uri for one in listed}) == len({one.label_id for one in listed})
+    assert any(one.refine == "REPLACE" for one in listed)
+
+
 @pytest.mark.parametrize("fit", ["none", pytest.param("renders", marks=pytest.mark.slow)])
 def test_lossless_is_identical(tmp_path: Path, fit: Any) -> None:
     before = replace(_ball(labels=False), quats=_ball().quats * 3)  # of any length
@@ -162,7 +181,7 @@ def test_lossless_is_identical(tmp_path: Path, fit: Any) -> None:
     said = [line for e in events if isinstance(e, StageDone) and e.name == "nest" for line in e.lines]
     assert any("as it came in" in line for line in said)
     kinds = {one.level: one.format for one in read_index(job.run.increments)}
-    assert (kinds[4], kinds[1]) == ("ply", "spz")
+    assert (kinds[4], kinds[1]) == ("ply", "stream")
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from sagesplat.adapt.observe import TOTAL, read_observations
 from sagesplat.adapt.plan_files import read_budget_plan, read_plans
 from sagesplat.core.config import NestConfig, PlanConfig, SceneConfig, TrainConfig
 from sagesplat.core.errors import DataError, RunError
-from sagesplat.formats.increments import packed, read_increments, read_index, totals, write_increments
+from sagesplat.formats.increments import read_increments, read_index, totals, write_increments
 from sagesplat.formats.levels import write_set
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.quantisation import in_buckets
@@ -294,7 +294,6 @@ def test_a_ladder_that_does_not_fit_its_gaussians_is_refused(tmp_path: Path) -> 
 def test_chunks_hold_what_each_level_adds(tmp_path: Path) -> None:
     sizes = {0: (1, 5, 20), 1: (2, 2, 20), 2: (20, 20, 20)}
     g = ordered().gaussians
-    g = g.select(torch.from_numpy(packed(g, sizes)))
     chunks = write_increments(
         tmp_path / "chunks", g, sizes, {0: "a b", 1: "c", 2: "d"}, label_of={0: 0, 1: 1, 2: 2}
     )

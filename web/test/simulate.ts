@@ -304,6 +304,7 @@ export class FakeRenderer implements Renderer {
   decoded = 0;
   swaps: { show: readonly Handle[]; hide: readonly Handle[] }[] = [];
   readonly corrupt = new Set<string>(); // "cell/level" that cannot be decoded
+  begins: readonly number[] = [1]; // levels that a stream begins with
   /** Called after every swap. */
   watch: () => void = () => {};
 
@@ -320,7 +321,8 @@ export class FakeRenderer implements Renderer {
     format: Format,
     below: readonly Uint8Array[] = [],
   ): Promise<Handle> {
-    if (below.length !== (format === "stream" ? level - 1 : 0)) throw new Error("without what is below");
+    const begin = this.begins.findLast((first) => first <= level) ?? 1;
+    if (below.length !== (format === "stream" ? level - begin : 0)) throw new Error("without what is below");
     const handle: Handle = { label, cell, level, count: bytes.length };
     return new Promise((resolve, reject) => {
       this.clock.after(this.delay, () => {

@@ -25,6 +25,7 @@ export function world(options: Options = {}, more: Partial<StreamerOptions> = {}
   const clock = on?.clock ?? new VirtualClock();
   const network = on?.network ?? new Network(clock);
   const renderer = new FakeRenderer(clock);
+  renderer.begins = [1, ...(options.replaces ?? [])];
   const manifest = more.manifest ?? bundle(network, options);
   const settings = more.settings ?? DEFAULTS;
   const streamer = new Streamer({

@@ -222,7 +222,7 @@ class AdoptConfig:
     """Sizes of the levels, as fractions of all Gaussians; categories that lose less keep fewer. Levels of
     fewer than 50 Gaussians are left out."""
     lossless: bool = False
-    """Send the highest levels as PLY, not SPZ: the last one is then identical to the file."""
+    """Send the highest levels as PLY, not rounded: the last one is then identical to the file."""
     cameras: Path | None = None
     """Where to look from: a capture with or without photos, a cameras.json of 3DGS, a transforms.json or a
     viewpoints.json (default: viewpoints drawn from the splat itself)."""

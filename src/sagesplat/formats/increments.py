@@ -2,20 +2,21 @@
 
 A cell is a category, or a part of one in space. Increments are ranges of coded streams, which are in one file
 for each category, or files of their own (SPZ, PLY). A level may replace those below it (`refine: REPLACE`, as
-in 3D Tiles): a cell then shows the increments from the newest such level on, and not the ones below.
+in 3D Tiles): a cell then shows the increments from the newest such level on, and not the ones below. A coded
+stream begins with each of these, so that none needs the bytes of what it replaces.
 """
 
 import hashlib
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby, pairwise
+from operator import itemgetter
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Int64
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
@@ -23,7 +24,7 @@ from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import put_ply, read_ply
-from sagesplat.formats.spz import SH_BITS, encode_spz, packing_order, position_step, read_spz
+from sagesplat.formats.spz import SH_BITS, encode_spz, position_step, read_spz
 from sagesplat.formats.stream import Decoded, decode_stream, starts_of_streams
 from sagesplat.io.files import atomic_folder, write_json
 from sagesplat.io.typed import read_json_as
@@ -66,12 +67,6 @@ class Increment:
     def format(self) -> Format:
         """Of the file, by its name."""
         return _FORMATS.get(Path(self.uri).suffix, "spz")
-
-
-def packed(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> Int64[np.ndarray, " N"]:
-    """Rows sorted by cell and level, and within a level, where any order is valid, by `packing_order`."""
-    rows = [part[packing_order(g.select(torch.from_numpy(part)))] for _, _, part in increments(g, sizes)]
-    return np.concatenate([*rows, np.arange(0)])
 
 
 def increments(g: Gaussians, sizes: Mapping[int, Sequence[int]]) -> list[tuple[int, int, np.ndarray]]:
@@ -129,17 +124,22 @@ def write_increments(
                 )
             else:
                 put_ply(temporary, part, antialiased=antialiased)
-            content = temporary.read_bytes()
-            digest = hashlib.sha256(content).hexdigest()
-            uri = f"{stems[cell]}-{level:02d}-{digest[:12]}.{suffix}"
-            temporary.rename(fresh / uri)
-            gpu = len(part) * GPU_BYTES[part.sh_degree]
-            refine: Refine = "REPLACE" if level in replaces.get(cell, ()) else "ADD"
-            written.append(
-                Increment(label_of[cell], cell, level, uri, len(part), len(content), gpu, digest, refine)
-            )
+            one = as_increment(temporary, part, label_of[cell], cell, level, stems[cell])
+            written.append(replace(one, refine="REPLACE" if level in replaces.get(cell, ()) else "ADD"))
         write_index(fresh, written)
     return written
+
+
+def as_increment(
+    temporary: Path, part: Gaussians, label_id: int, cell: int, level: int, stem: str
+) -> Increment:
+    """The increment of a file that holds `part`, which gets a name with its hash."""
+    content = temporary.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
+    uri = f"{stem}-{level:02d}-{digest[:12]}{temporary.suffix}"
+    temporary.rename(temporary.with_name(uri))
+    gpu = len(part) * GPU_BYTES[part.sh_degree]
+    return Increment(label_id, cell, level, uri, len(part), len(content), gpu, digest)
 
 
 def write_index(folder: Path, written: Sequence[Increment]) -> None:
@@ -168,10 +168,13 @@ def read_increments(folder: Path, listed: Sequence[Increment], *, by_category: b
     parts = []
     for some in by_file(folder, listed):
         if some[0].format == "stream":
-            decoded = stream_of(folder, some)
-            part = decoded.shown().slices([_rows(folder, decoded, one) for one in some])
+            found = [
+                decoded.shown().slices([_rows(folder, decoded, one) for one in own])
+                for decoded, own in streams_of(folder, some)
+            ]
         else:
-            part = concat([_read(folder, increment) for increment in some])
+            found = [_read(folder, increment) for increment in some]
+        part = concat(found)
         if by_category:
             part = replace(part, label_ids=torch.full_like(part.label_ids, some[0].label_id))
         parts.append(part)
@@ -179,22 +182,29 @@ def read_increments(folder: Path, listed: Sequence[Increment], *, by_category: b
 
 
 def by_file(folder: Path, listed: Sequence[Increment]) -> list[list[Increment]]:
-    """Increments of a cell that lie one after the other in one file; DataError without any."""
+    """Increments that follow each other and are of one file; DataError without any."""
     if not listed:
         raise DataError(f"{folder}: no increments; {_CURE}")
-    return [list(some) for _, some in groupby(listed, key=lambda one: (one.uri, one.cell))]
+    return [list(some) for _, some in groupby(listed, key=lambda one: one.uri)]
 
 
-def stream_of(folder: Path, some: Sequence[Increment]) -> Decoded:
-    """The stream that increments of a cell are in, up to the newest of them; `ends` are bytes of the file."""
-    path, end = folder / some[0].uri, max(one.offset + one.nbytes for one in some)
+def streams_of(folder: Path, some: Sequence[Increment]) -> Iterator[tuple[Decoded, list[Increment]]]:
+    """The streams that increments of one file are in, in their order, with the increments of each.
+
+    A stream is decoded up to the newest of its increments; its `ends` are bytes of the file.
+    """
+    path = folder / some[0].uri
     try:
         content = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from None
-    start = max(at for at in starts_of_streams(content, name=str(path)) if at <= some[0].offset)
-    decoded = decode_stream(content[start:end], label_id=some[0].cell, name=str(path))
-    return replace(decoded, start=start, ends=tuple(start + at for at in decoded.ends))
+    starts = starts_of_streams(content, name=str(path))
+    places = np.searchsorted(starts, [one.offset for one in some], "right") - 1
+    for place, own in groupby(zip(places.tolist(), some, strict=True), key=itemgetter(0)):
+        listed, start = [one for _, one in own], starts[place]
+        end = max(one.offset + one.nbytes for one in listed)
+        decoded = decode_stream(content[start:end], label_id=listed[0].cell, name=str(path))
+        yield replace(decoded, start=start, ends=tuple(start + at for at in decoded.ends)), listed
 
 
 def _rows(folder: Path, decoded: Decoded, one: Increment) -> slice:

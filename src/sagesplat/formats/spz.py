@@ -22,11 +22,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Int64
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.geometry import morton_order
 from sagesplat.core.sh import BASES, bases
 from sagesplat.core.transform import transformed
 from sagesplat.formats.labels import as_json, labelled
@@ -184,18 +182,6 @@ def position_step(g: Gaussians) -> tuple[float, float]:
     extent = max(float(g.means.abs().max()), 2.0**-MAX_BITS)
     size = 2.0 ** -_enough_bits(g.log_scales.detach().cpu().numpy(), 1, least=-MAX_BITS)
     return 2.0 ** -min(int(np.floor(np.log2(_LARGEST / extent))), MAX_BITS), size
-
-
-def packing_order(g: Gaussians) -> Int64[np.ndarray, " N"]:
-    """The order by SH coefficients, then colour, which compresses 3 to 5 % better than Morton order.
-
-    Use it as `g.select(torch.from_numpy(order))`. Neighbours in the file are then not neighbours in space;
-    some viewers draw spatially sorted files faster.
-    """
-    g = g.detach().to("cpu")
-    harmonics = in_buckets(g.shN, SH_BITS).flatten(1).numpy()
-    colours = np.argsort(morton_order(g.sh0[:, 0].numpy()))  # ranks
-    return np.lexsort((colours, *harmonics.T[::-1]))
 
 
 def read_spz(path: Path | str, label_id: int = -1, *, frame: Frame = "rub") -> Gaussians:

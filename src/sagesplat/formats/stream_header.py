@@ -1,14 +1,14 @@
 """The header of a coded stream, and the steps by which it turns Gaussians into integers and back."""
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
-from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.sh import BASES
 from sagesplat.formats.quantisation import PER_COLOUR, in_buckets, logits_of_bytes
 from sagesplat.formats.spz import flipped
@@ -24,6 +24,8 @@ _SMALLEST = 2**-8  # step that a precision can ask for
 _CLASS = 11 / 8  # natural log of what makes a rotation one class finer: of 2 log(largest) - log(smallest)
 _MIDDLE = 6.5  # class of the median
 _FARTHEST = 2**15 - 1  # magnitude of an origin
+_COARSEST = 1 / 3  # step of positions, of the median of the middle standard deviations: 0.002 of SSIM
+_ROUNDED = 2**17  # Gaussians at a time
 _LONGEST_LOG = 40  # magnitude of a log scale
 _RANGE = 1e18  # magnitude of a position; its square is finite in float32
 # by 3 times the first axis plus the second: the rotation wxyz that turns x and y to them or their opposites
@@ -58,6 +60,14 @@ class Precision:
             raise ValueError(f"{self.sh_bits} bits, {self.rotation} classes; 1 to 8 and -9 to 9 are there")
         if not 0.5 <= self.least <= 255:
             raise ValueError(f"opacities of {self.least} steps; from 0.5 on they are in the format")
+
+
+# of Gaussians as they came in, ascending; harmonics need more bits where a picture shows them
+AS_GIVEN = (
+    Precision(position=1 / 8, opacity=3, log_scale=1 / 16, rotation=2.0),
+    Precision(position=1 / 8, opacity=3, log_scale=1 / 16, rotation=2.0, sh_bits=(6, 6)),
+    Precision(position=1 / 12, opacity=2, log_scale=1 / 24, rotation=3.0, sh_bits=(7, 7), least=0.5),
+)
 
 
 @dataclass(frozen=True)
@@ -139,6 +149,18 @@ def read_header(content: bytes) -> Header:
     )  # fmt: skip
 
 
+def position_steps(g: Gaussians) -> tuple[float, float]:
+    """Steps of positions: those that the Gaussians' box needs, and those that would be too large for most."""
+    widest, middle = _steps(g.means.double().numpy(), np.sort(g.log_scales.double().numpy(), axis=1))
+    return widest, _COARSEST * middle
+
+
+def _steps(means: np.ndarray, logs: np.ndarray) -> tuple[float, float]:
+    """The step that the box of these positions needs, and the median of the middle standard deviations."""
+    middle = float(np.exp(np.median(logs[:, 1]).clip(-_LONGEST_LOG, _LONGEST_LOG)))
+    return float((means - means.min(0)).max()) / (_CELLS - 2), middle
+
+
 def header_of(
     g: Gaussians, levels: int, precision: Precision, *, antialiased: bool, two_opacities: bool
 ) -> Header:
@@ -147,8 +169,7 @@ def header_of(
     if not len(means):
         means, logs = np.zeros((1, 3)), np.zeros((1, 3))
     low = means.min(0)
-    middle = float(np.exp(np.median(logs[:, 1]).clip(-_LONGEST_LOG, _LONGEST_LOG)))
-    widest = float((means - low).max()) / (_CELLS - 2)
+    widest, middle = _steps(means, logs)
     scales = np.rint(logs.clip(-_LONGEST_LOG, _LONGEST_LOG) / precision.log_scale)
     colours = (g.sh0.double().numpy() * PER_COLOUR + 127.5) / precision.colour
     origin = int(np.median(scales[:, 2]))
@@ -227,6 +248,17 @@ def restored(columns: Columns, header: Header, label_id: int) -> Gaussians:
         shN=torch.from_numpy(shN),
         label_ids=torch.full((len(means),), label_id, dtype=torch.int16),
     )
+
+
+def rounded(g: Gaussians, precision: Precision) -> Gaussians:
+    """N Gaussians on the CPU in COLMAP's axes, about as streams of them keep them; none is left out."""
+    parts = []
+    for first in range(0, len(g), _ROUNDED):  # integers take several times the memory
+        part = turned_round(g.slices([slice(first, min(first + _ROUNDED, len(g)))]))
+        header = header_of(part, 1, precision, antialiased=False, two_opacities=False)
+        columns = quantised(part, part.logit_opacities, header)
+        parts.append(replace(restored(columns, header, 0), label_ids=part.label_ids))
+    return concat(parts)
 
 
 def turned_round(g: Gaussians) -> Gaussians:

@@ -1,21 +1,36 @@
-"""Increments of nested levels as coded streams: one for each cell, one file for each category."""
+"""Increments of nested levels as coded streams: one file for each category.
+
+A cell has a stream for each set of Gaussians that replaces the one below it, and one where none does. The
+first levels of all cells come before what replaces them, so that a viewer gets them in one piece.
+"""
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Int64, Integer
 
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.names import slugs
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.increments import GPU_BYTES, STREAM, Increment, by_file, stream_of, write_index
+from sagesplat.formats.increments import (
+    GPU_BYTES,
+    STREAM,
+    Increment,
+    as_increment,
+    by_file,
+    streams_of,
+    write_index,
+)
+from sagesplat.formats.levels import starts_of
+from sagesplat.formats.ply import put_ply
 from sagesplat.formats.stream import Encoded, encode_stream
-from sagesplat.formats.stream_header import Grid, Precision
+from sagesplat.formats.stream_header import Grid, Precision, position_steps
 from sagesplat.io.files import atomic_folder
 
 
@@ -28,6 +43,17 @@ class Streams:
     rows: Int64[np.ndarray, " M"]  # of the Gaussians that were given, in the order of the increments
 
 
+@dataclass(frozen=True, eq=False)
+class _Set:
+    """Levels of a cell that are prefixes of one sequence of Gaussians, which replaces what is below."""
+
+    cell: int
+    level: int  # the first of them
+    rows: Int64[np.ndarray, " N"]  # of the Gaussians that were given
+    sizes: tuple[int, ...]  # of these, up to the end of each level
+    increments: tuple[Increment, ...] = ()  # once it is written
+
+
 def write_streams(
     folder: Path,
     g: Gaussians,
@@ -36,69 +62,143 @@ def write_streams(
     *,
     label_of: Mapping[int, int],
     second: SecondOpacities | None = None,
+    replaces: Mapping[int, Collection[int]] | None = None,
+    last: Precision | None = Precision(),
     antialiased: bool = False,
     grids: Mapping[int, Grid] | None = None,
 ) -> Streams:
     """Write the increments of nested levels as a file of coded streams for each category, and their index.
 
-    `folder` is replaced. `sizes`, `names` and `label_of` as in `write_increments`; `second`: second opacities
-    of the Gaussians, with weights of all cells. `grids`: by cell id, of Gaussians that were decoded before,
-    what they are rounded to already. What is hardly to be seen is left out (see `encode_stream`,
-    whose errors are raised), and with it a cell or category that has nothing else.
+    `folder` is replaced. `sizes`, `names`, `label_of` and `replaces` as in `write_increments`. `second`:
+    second opacities of the Gaussians, with weights of all cells, where no level replaces. `last`: how finely
+    the levels are kept from the last one on that replaces; None: exactly, as a PLY file each. `grids`: by
+    cell id, of Gaussians that were decoded before, what they are rounded to already.
+
+    What is hardly to be seen is left out (see `encode_stream`, whose errors are raised), and with it a cell
+    or category that has nothing else. With `replaces`, a Gaussian of each set stays; and sets are PLY files
+    where some Gaussians lie so far off that a stream's steps of positions would be too large for most.
+
+    ValueError for levels that cannot replace.
     """
     labels = sorted({label_of[cell] for cell in sizes})
     stems = slugs({label: names.get(label, str(label)) for label in labels})
-    cells = g.label_ids.cpu().numpy()
-    written, left, order = list[Increment](), dict[int, tuple[int, ...]](), [np.arange(0)]
+    cells, bits = g.label_ids.cpu().numpy(), GPU_BYTES[g.sh_degree]
+    made = list[_Set]()
     with atomic_folder(folder) as fresh:
         for label in labels:
-            coded, content = list[tuple[int, int, Encoded]](), b""
-            for cell in sorted(cell for cell in sizes if label_of[cell] == label):
-                rows = torch.from_numpy(np.flatnonzero(cells == cell))
-                precision = Precision(grid=(grids or {}).get(cell))
-                own = second and SecondOpacities(second.logits[rows], {cell: second.weights[cell]})
-                made = encode_stream(
-                    g.select(rows), sizes[cell], second=own, precision=precision, antialiased=antialiased,
-                    name=stems[label],
+            content, mine = b"", list[_Set]()
+            for one, is_last in _sets(cells, sizes, replaces, [c for c in sizes if label_of[c] == label]):
+                part, stem = g.select(torch.from_numpy(one.rows)), stems[label]
+                precision = last if is_last else Precision()
+                if precision is None or (replaces and np.greater(*position_steps(part))):
+                    mine.append(_in_files(fresh, part, one, label, stem, antialiased))
+                    continue
+                part = _with_one_seen(part, one.sizes[0], precision) if replaces else part
+                own = second and SecondOpacities(
+                    second.logits[one.rows], {one.cell: second.weights[one.cell]}
+                )
+                coded = encode_stream(
+                    part, one.sizes, second=own, antialiased=antialiased, name=stem,
+                    precision=replace(precision, grid=(grids or {}).get(one.cell)),
                 )  # fmt: skip
-                if len(made.rows):
-                    coded.append((cell, len(content), made))
-                    content += made.content
-                    left[cell] = made.sizes
-                    order.append(rows.numpy()[made.rows])
+                if len(coded.rows):
+                    ranges = _ranges(label, one, f"{stem}{STREAM}", len(content), coded, bits)
+                    mine.append(replace(one, rows=one.rows[coded.rows], sizes=coded.sizes, increments=ranges))
+                    content += coded.content
             if content:
                 uri = f"{stems[label]}-{hashlib.sha256(content).hexdigest()[:12]}{STREAM}"
                 (fresh / uri).write_bytes(content)
-                for cell, start, made in coded:
-                    written += _ranges(label, cell, uri, start, made, GPU_BYTES[g.sh_degree])
+                mine = [replace(one, increments=_named(one.increments, uri)) for one in mine]
+            made += sorted(mine, key=lambda one: one.cell)
+        written = [increment for one in made for increment in one.increments]
         write_index(fresh, written)
-    return Streams(written, left, np.concatenate(order))
+    left = dict[int, tuple[int, ...]]()
+    for one in made:
+        below = left.get(one.cell, ())
+        left[one.cell] = below + tuple(end + (below[-1] if below else 0) for end in one.sizes)
+    return Streams(written, left, np.concatenate([np.arange(0), *(one.rows for one in made)]))
 
 
-def _ranges(label: int, cell: int, uri: str, start: int, coded: Encoded, gpu_bytes: int) -> list[Increment]:
-    """The increments of a stream, which begins at the byte `start` of its file.
+def _sets(
+    cells: Integer[np.ndarray, " N"],
+    sizes: Mapping[int, Sequence[int]],
+    replaces: Mapping[int, Collection[int]] | None,
+    wanted: Sequence[int],
+) -> list[tuple[_Set, bool]]:
+    """The sets of some cells, the lowest of all cells first, and whether a set is its cell's last.
+
+    `cells`: of all Gaussians. ValueError for levels that cannot replace.
+    """
+    found = list[tuple[int, _Set, bool]]()
+    for cell in sorted(wanted):
+        rows, ends = np.flatnonzero(cells == cell), sizes[cell]
+        firsts = [1, *sorted((replaces or {}).get(cell, ()))]
+        starts_of(ends, firsts[1:])
+        for number, (first, after) in enumerate(pairwise([*firsts, len(ends) + 1])):
+            start = ends[first - 2] if number else 0
+            own = tuple(end - start for end in ends[first - 1 : after - 1])
+            one = _Set(cell, first, rows[start : start + own[-1]], own)
+            found.append((number, one, first == firsts[-1]))
+    return [(one, is_last) for _, one, is_last in sorted(found, key=lambda of: (of[0], of[1].cell))]
+
+
+def _with_one_seen(g: Gaussians, first: int, precision: Precision) -> Gaussians:
+    """The Gaussians with the most opaque of the `first` ones opaque enough for a stream to keep it."""
+    logits = g.logit_opacities.clone()
+    row = int(logits[: max(first, 1)].argmax())
+    least = min((precision.least + 1) * precision.opacity / 255, 0.9)
+    logits[row] = max(float(logits[row]), math.log(least / (1 - least)))
+    return replace(g, logit_opacities=logits)
+
+
+def _in_files(folder: Path, g: Gaussians, one: _Set, label: int, stem: str, antialiased: bool) -> _Set:
+    """The set of these Gaussians with its increments, each of which is written as a PLY."""
+    written = list[Increment]()
+    for level, (low, high) in enumerate(pairwise((0, *one.sizes)), one.level):
+        if high > low:
+            part, temporary = g.slices([slice(low, high)]), folder / "increment.ply"
+            put_ply(temporary, part, antialiased=antialiased)
+            written.append(as_increment(temporary, part, label, one.cell, level, f"{stem}-{one.cell}"))
+    return replace(one, increments=_replacing(written, one.level))
+
+
+def _ranges(
+    label: int, one: _Set, uri: str, start: int, coded: Encoded, gpu_bytes: int
+) -> tuple[Increment, ...]:
+    """The increments of a set's stream, which begins at the byte `start` of its file.
 
     The bytes of a level without Gaussians belong to the next, or the last.
     """
     counts = np.diff(coded.sizes, prepend=0).tolist()
     levels = [i for i, count in enumerate(counts) if count]
     cuts = [0, *(coded.ends[i] for i in levels[:-1]), len(coded.content)]
-    return [
+    ranges = [
         Increment(
-            label, cell, i + 1, uri, counts[i], high - low, counts[i] * gpu_bytes,
+            label, one.cell, one.level + i, uri, counts[i], high - low, counts[i] * gpu_bytes,
             hashlib.sha256(coded.content[low:high]).hexdigest(),
             offset=start + low, weight=coded.weights[i] if coded.weights else None,
         )
         for i, (low, high) in zip(levels, pairwise(cuts), strict=True)
     ]  # fmt: skip
+    return _replacing(ranges, one.level)
+
+
+def _replacing(increments: Sequence[Increment], level: int) -> tuple[Increment, ...]:
+    """Increments of a set from `level` on, the first of which replaces what is below it."""
+    return tuple(replace(one, refine="REPLACE") if one.level == level > 1 else one for one in increments)
+
+
+def _named(increments: Sequence[Increment], uri: str) -> tuple[Increment, ...]:
+    """Increments with the name of the file that holds the streams among them."""
+    return tuple(replace(one, uri=uri) if one.format == "stream" else one for one in increments)
 
 
 def read_streams(folder: Path, listed: Sequence[Increment]) -> tuple[Gaussians, SecondOpacities | None]:
-    """What all increments of `write_streams` hold: Gaussians, and their second opacities if they have some.
+    """What increments hold that all are streams: Gaussians, and their second opacities if they have some.
 
     `label_ids` and weights are by cell. DataError for a missing or damaged file.
     """
-    found = [stream_of(folder, some) for some in by_file(folder, listed)]
+    found = [stream for some in by_file(folder, listed) for stream, _ in streams_of(folder, some)]
     g, seconds = concat([one.gaussians for one in found]), [one.second for one in found if one.second]
     if not seconds:
         return g, None

@@ -15,8 +15,10 @@ from sagesplat.adapt.renders import Renders
 from sagesplat.core.config import AdoptConfig, NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import packed, read_increments, write_increments
+from sagesplat.formats.increments import read_increments
 from sagesplat.formats.levels import write_set
+from sagesplat.formats.stream_header import AS_GIVEN, Precision, rounded
+from sagesplat.formats.stream_increments import write_streams
 from sagesplat.metrics.image import ssim_map
 from sagesplat.raster import device_of
 from sagesplat.run.job import Job
@@ -53,7 +55,7 @@ _WEIGH = 32  # views that importance is measured in
 _REFIT = 24  # views that colours are fitted to, and trained sets are ordered by
 _TRAINED = 0.5  # largest share that is trained
 _SMALL = 0.1  # share up to which colours take more rounds: little is left as it was, and rounds are cheap
-_ROUNDED = 35.0  # dB; from there up the last level looks like what came in
+_KEPT = 0.999  # SSIM of the last level to what came in, from which it looks the same
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
 
 
@@ -65,6 +67,7 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     steps = config.steps if config.fit == "renders" else 0
     settings = asdict(NestConfig(steps=steps, levels=len(shares), base_share=0, rate_weight=0.0))
     settings |= {"fit": config.fit, "shares": shares, "lossless": config.lossless, "seed": config.seed}
+    settings |= {"increments": "streams"}  # once they were SPZ files
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
 
     def make() -> list[str]:
@@ -84,9 +87,8 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
             least = first_of_all(ordered, share, least).counts()
             levels.append(least)
         ladder = assemble([*sets, Set(ordered, tuple(levels))])
-        coarse = sum(share <= _TRAINED for share in shares[:-1]) if config.fit == "renders" else 0
         ladder, label_of = in_cells(ladder, cells_wanted(len(ordered)))
-        lines = _write(job, ladder, label_of, num_lower, coarse, g, settings, config.lossless)
+        lines = _write(job, ladder, label_of, num_lower, g, settings, config.lossless)
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -178,51 +180,58 @@ def _write(
     ladder: Assembled,
     label_of: Mapping[int, int],
     num_lower: int,
-    coarse: int,
     before: Gaussians,
     settings: dict[str, Any],
     lossless: bool,
 ) -> list[str]:
     """Write the ladder and its increments.
 
-    The levels above `num_lower` are of the originals. Those up to `coarse` were trained in the larger steps
-    that they are rounded to; the others would lose by it.
+    The levels above `num_lower` are of the originals: exact, or rounded as finely as they need to look the
+    same. Those below are rounded as trained levels are.
     """
     run, levels = job.run, len(next(iter(ladder.sizes.values())))
     run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
-    g = ladder.gaussians.select(torch.from_numpy(packed(ladder.gaussians, ladder.sizes)))
-    chunks = write_increments(
-        run.increments, g, ladder.sizes, job.names(), label_of=label_of,
-        replaces=ladder.replaces,
-        kind=lambda _, level: "ply" if lossless and level > num_lower else "spz",
-        fine=range(coarse + 1, levels + 1), antialiased=job.antialiased,
+    targets = [(row, _image(job, before, row)) for row in spread(job.scene.train_ids.tolist(), _COMPARE)]
+    made = write_streams(
+        run.increments, ladder.gaussians, ladder.sizes, job.names(), label_of=label_of,
+        replaces=ladder.replaces, last=None if lossless else _precision(job, before, targets),
+        antialiased=job.antialiased,
     )  # fmt: skip
-    sent = read_increments(run.increments, chunks)
-    if not lossless and (other := sum(chunk.format != "spz" for chunk in chunks)):
-        job.emit(Warned(f"{other} files are PLY: SPZ's steps of positions are larger than their Gaussians"))
-    write_set(run.prefixes, sent, settings["steps"], ladder.sizes, replaces=ladder.replaces, exact=True)
-    write_cells(run.cells, describe_cells(sent, dict(label_of)))
-    size, total = sum(chunk.nbytes for chunk in chunks), len(sent)
+    sent = read_increments(run.increments, made.increments)
+    write_set(run.prefixes, sent, settings["steps"], made.sizes, replaces=ladder.replaces, exact=True)
     top = NestedLadder(read_prefixes(run.prefixes), dict(label_of)).load(levels)
-    decibels = _loss(job, top, before)
-    if decibels < _ROUNDED and not lossless:
-        job.emit(Warned(f"SPZ rounds the last level to {decibels:.1f} dB; --lossless keeps it as it came in"))
-    loss = "as it came in" if np.isinf(decibels) else f"PSNR {decibels:.1f} dB against what came in"
+    ssim, decibels = _kept(job, top, targets)
+    if not lossless and (other := sum(one.format != "stream" for one in made.increments)):
+        job.emit(Warned(f"{other} files are PLY: some of their Gaussians lie too far off to be rounded"))
+    write_cells(run.cells, describe_cells(sent, dict(label_of)))
+    size, files = sum(one.nbytes for one in made.increments), len({one.uri for one in made.increments})
+    if ssim < _KEPT and not lossless:
+        job.emit(
+            Warned(f"rounding costs {1 - ssim:.4f} of SSIM; --lossless keeps the last level as it came in")
+        )
+    loss = f"SSIM {ssim:.5f}, PSNR {decibels:.1f} dB to what came in"
+    loss = "as it came in" if np.isinf(decibels) else loss
     return [
         f"{levels} levels, {num_lower} of them of merged Gaussians; "
-        f"{size / 1e6:.2f} MB in {len(chunks)} files",
-        f"{total:,} Gaussians, {len(before):,} of them at the last level: {loss}",
+        f"{size / 1e6:.2f} MB in {files} file{'s' if files > 1 else ''}",
+        f"{len(sent):,} Gaussians, {len(before):,} of them at the last level: {loss}",
     ]
 
 
-def _loss(job: Job, top: Gaussians, before: Gaussians) -> float:
-    """PSNR of the last level against what came in, dB; infinite where it is the same."""
-    errors = []
-    for row in spread(job.scene.train_ids.tolist(), _COMPARE):
-        one, other = (_image(job, g, row) for g in (top, before))
-        errors.append(float(np.square(one - other).mean()))
-    error = float(np.mean(errors))
-    return -10 * float(np.log10(error)) if error else float("inf")
+def _precision(job: Job, g: Gaussians, targets: Sequence[tuple[int, np.ndarray]]) -> Precision:
+    """The coarsest steps that Gaussians as they came in look the same in, else the finest."""
+    for precision in AS_GIVEN[:-1]:
+        if _kept(job, rounded(g, precision), targets[::2])[0] >= _KEPT:
+            return precision
+    return AS_GIVEN[-1]
+
+
+def _kept(job: Job, top: Gaussians, targets: Sequence[tuple[int, np.ndarray]]) -> tuple[float, float]:
+    """Mean SSIM and PSNR in dB of the last level to images of what came in, by view; infinite if the same."""
+    images = [(_image(job, top, row), image) for row, image in targets]
+    error = float(np.mean([np.square(one - other).mean() for one, other in images]))
+    ssim = float(np.mean([ssim_map(one, other).mean() for one, other in images]))
+    return ssim, -10 * float(np.log10(error)) if error else float("inf")
 
 
 def _ssim(job: Job, targets: Photos, g: Gaussians, rows: Sequence[int]) -> float:

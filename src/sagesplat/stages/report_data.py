@@ -135,7 +135,7 @@ def _adopted(job: Job, ladder: NestedLadder) -> list[tuple[str, str]]:
         ("labels", "those of the file, if it has any" if made["labelled"] else "votes of label images"),
         ("lower levels", trained if nest["fit"] == "renders" else "merged Gaussians, not trained"),
         ("originals from level", originals or "1"),
-        ("last level", "identical to the file" if nest["lossless"] else "the file, rounded as SPZ"),
+        ("last level", "identical to the file" if nest["lossless"] else "the file, rounded"),
     ]
 
 

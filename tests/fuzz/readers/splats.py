@@ -70,8 +70,11 @@ def _index(folder: Path, size: int) -> list[bytes]:
     replacing = chunk | {"uri": "sky-02.ply", "level": 2, "refine": "REPLACE"}
     both = {"format": "spz+ply", "chunks": [chunk, replacing]}
     streams = {"format": "stream", "chunks": _ranges(folder)}
+    sets = [one | {"cell": 2, "level": level} for level, one in enumerate(_ranges(folder), 1)]
+    sets[2]["refine"] = "REPLACE"  # a second stream of the cell
+    last = {"format": "stream+ply", "chunks": [*sets, replacing | {"level": 5}]}
     return as_json(
-        {"format": "spz", "chunks": chunks}, {"format": "spz", "chunks": [chunk, chunk]}, both, streams
+        {"format": "spz", "chunks": chunks}, {"format": "spz", "chunks": [chunk, chunk]}, both, streams, last
     )
 
 

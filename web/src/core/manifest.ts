@@ -84,7 +84,9 @@ function cellDefects({ levels, bounds, points }: Cell, path: string): string[] {
   return wrong;
 }
 
-/** A cell's levels are consecutive ranges of one file, or files; those of a label's cells fill theirs. */
+const ALONE = "must be one stream, in a file of the label's own";
+
+/** Of a cell, the levels that are ranges touch from one that replaces to the next; all of a label fill a file. */
 function streamDefects({ labels }: Manifest): string[] {
   const others = new Set<string>(); // files of the labels before
   return labels.flatMap(({ cells }, i) => {
@@ -92,23 +94,31 @@ function streamDefects({ labels }: Manifest): string[] {
     const ranges: Level[] = [];
     for (const [j, { levels }] of cells.entries()) {
       const odd = (what: string) => wrong.push(`labels[${i}].cells[${j}].levels ${what}`);
-      const uri = levels[0]?.uri ?? "";
-      if (!levels.some(({ format }) => format === "stream")) {
-        const is = levels.some(({ offset, weight }) => offset !== undefined || weight !== undefined);
-        if (is) odd("have offsets or weights, which only streams have");
-        continue;
+      const streams = levels.filter(({ format }) => format === "stream");
+      const files = levels.filter(({ format }) => format !== "stream");
+      if (files.some(({ offset, weight }) => offset !== undefined || weight !== undefined)) {
+        odd("have offsets or weights, which only streams have");
       }
-      ranges.push(...levels);
-      if (levels.some((l) => l.uri !== uri || l.format !== "stream" || l.refine) || others.has(uri)) {
-        odd("must be one stream, in a file of the label's own");
+      const uri = (ranges[0] ?? streams[0])?.uri ?? "";
+      ranges.push(...streams);
+      if (streams.some((level) => level.uri !== uri) || others.has(uri)) {
+        odd(ALONE);
       }
-      const touch = levels.every(({ offset = Number.NaN }, k) => {
+      levels.forEach((level, k) => {
         const below = levels[k - 1];
-        return offset === (below ? (below.offset ?? 0) + below.bytes : offset);
+        if (!below || level.refine) return;
+        if (level.format !== below.format && [level, below].some(({ format }) => format === "stream")) {
+          odd(ALONE);
+        }
+      });
+      const touch = levels.every(({ format, refine, offset = Number.NaN }, k) => {
+        const below = refine ? undefined : levels[k - 1];
+        return format !== "stream" || offset === (below ? (below.offset ?? 0) + below.bytes : offset);
       });
       if (!touch) odd("must be ranges without gaps");
       const weights = levels.filter(({ weight }) => weight !== undefined).length;
       if (weights && weights < levels.length) odd("must all have a weight, or none");
+      if (weights && levels.some(({ refine }) => refine)) odd("have weights, and some replace those below");
     }
     const ends = new Map<string, number>();
     for (const { uri, offset, bytes } of ranges.sort((a, b) => (a.offset ?? 0) - (b.offset ?? 0))) {

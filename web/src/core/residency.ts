@@ -40,10 +40,10 @@ export class Entry {
     this.decoded = cell.levels.map(() => undefined);
   }
 
-  /** The increments below one that its decoder needs: of a stream all of the cell, which came in their order. */
+  /** The increments below one that its decoder needs: those of its stream, which came in their order. */
   below(level: number): readonly Uint8Array[] {
     if (this.cell.levels[level - 1]?.format !== "stream") return [];
-    return this.contents.slice(0, level - 1).flatMap((content) => content ?? []);
+    return this.contents.slice(this.start(level), level - 1).flatMap((content) => content ?? []);
   }
 
   /** Number of increments below a level that are not part of it, since it or a level below it replaces them. */

@@ -41,6 +41,7 @@ interface Column {
 export const Mark = { plain: 0, lit: 1, hidden: 2 } as const;
 const LIT = [255, 190, 40] as const; // colour that lit splats are mixed with
 const LIT_SHARE = 0.65;
+const LEVELS = 256; // more than a cell has: the streams of a cell are numbered by their first levels
 
 /** A view of the shown prefix of the stored splats: going down a level needs no upload. */
 class Source {
@@ -123,7 +124,7 @@ export class SparkLayer implements Renderer {
   ): Promise<Increment> {
     const part =
       format === "stream"
-        ? await this.#decoders.decode(cell, [...below, bytes])
+        ? await this.#decoders.decode(cell * LEVELS + level - below.length, [...below, bytes])
         : await decodePart(bytes, format);
     const bounds = boundsOf(part.splats, part.count, part.encoding);
     return { label, cell, level, count: part.count, part, bounds };

@@ -16,6 +16,14 @@ const promises = JSON.parse(new TextDecoder().decode(network.files.get("promises
 const packed = bundle(network, { labels: 2, levels: 2, bytes: 100, pack: true });
 const streams = bundle(network, { labels: 2, levels: 3, bytes: 100, streams: true });
 const parted = bundle(network, { labels: 2, cells: 3, levels: 2, bytes: 100, streams: true, pack: true });
+const replacing = bundle(network, {
+  labels: 2,
+  cells: 3,
+  levels: 4,
+  bytes: 100,
+  streams: true,
+  replaces: [2, 4],
+});
 
 /** A document with another value at a path such as labels.0.id; undefined takes it away. */
 function changed(document: unknown, path: string, value: unknown): string {
@@ -47,7 +55,7 @@ test("the types are those of the schema", async () => {
 });
 
 test("a good manifest is taken as it is, with fields of later versions", () => {
-  for (const made of [plain, packed, streams, parted]) {
+  for (const made of [plain, packed, streams, parted, replacing]) {
     expect(parseManifest(JSON.stringify(made))).toEqual(JSON.parse(JSON.stringify(made)));
   }
   for (const [path, value] of [
@@ -62,6 +70,9 @@ test("a good manifest is taken as it is, with fields of later versions", () => {
   const weighted = streams.labels[0]?.cells[0]?.levels.map((level, k) => ({ ...level, weight: k / 2 }));
   const found = parseManifest(changed(streams, "labels.0.cells.0.levels", weighted));
   expect(found.labels[0]?.cells[0]?.levels[1]?.weight).toBe(0.5);
+  const files = plain.labels[0]?.cells[0]?.levels.map((level) => ({ ...level, refine: "REPLACE" }));
+  const highest = [...(replacing.labels[0]?.cells[2]?.levels ?? []), ...(files ?? [])];
+  expect(parseManifest(changed(replacing, "labels.0.cells.2.levels", highest))).toBeTruthy();
 });
 
 test("another version says so, whatever else it holds", () => {
@@ -165,7 +176,10 @@ test.each<[string, unknown, string, Manifest?]>([
   [`${LEVELS}.0.bytes`, first.bytes - 1, GAPS, streams],
   [`${LEVELS}.1.uri`, "chunks/other.sgst", ALONE, streams],
   [`${LEVELS}.1.format`, "spz", ALONE, streams],
-  [`${LEVELS}.1.refine`, "REPLACE", ALONE, streams],
+  [`${LEVELS}.2.offset`, 1, GAPS, replacing],
+  [`${LEVELS}.1.format`, "spz", "offsets or weights, which only streams have", replacing],
+  [`${LEVELS}.2.uri`, "chunks/other.sgst", ALONE, replacing],
+  [`${LEVELS}.1.weight`, 0.5, "levels have weights, and some replace those below", replacing],
   [`${LEVELS}.1.weight`, 0.5, "labels[0].cells[0].levels must all have a weight, or none", streams],
   [`${LEVELS}.1.weight`, 1.5, "levels[1].weight must be a number from 0 to 1", streams],
   [

@@ -40,6 +40,14 @@ test("above a level that replaces, the first comes first, and those between are 
   expect(gpuBytes).toBe(w.manifest.totals.gpuBytes + first); // in memory, for the way back
 });
 
+test("a stream that replaces those below needs nothing of theirs", async () => {
+  const w = await started("full", { labels: 1, streams: true, cells: 2, replaces: [2, 4] });
+  expect(shown(w.streamer.state)).toEqual([5, 5]);
+  expect(w.renderer.decoded).toBe(2 * 3); // the first level, and those of the last stream
+  await w.run({ mode: "base" });
+  expect(shown(w.streamer.state)).toEqual([1, 1]);
+});
+
 test("below it levels add up as ever", async () => {
   const w = await started("base", { labels: 1 });
   expect(shown(w.streamer.state)).toEqual([1]);
