@@ -503,16 +503,3 @@ def test_long_names_have_legends_too(tmp_path, monkeypatch):
     data = led_by_fidelity(panels=1)
     names = dict.fromkeys(data.names, "a category whose name is longer than most of them are")
     assert write_report(tmp_path, dataclasses.replace(data, names=names)).exists()
-
-
-def test_the_map_of_viewpoints_of_a_scene_in_blocks(tmp_path, monkeypatch):
-    """A category's rows are those of all its blocks; the map has a dot for each viewpoint."""
-    save = figures.save_figure
-    only = {"viewpoints": save}
-    monkeypatch.setattr(
-        figures, "save_figure", lambda figure, path, **_: only.get(path.stem, laid_out)(figure, path)
-    )
-    page = whole_page()
-    first, *others = page.drawn
-    data = dataclasses.replace(page, categories=dict.fromkeys(others, first))
-    assert (write_report(tmp_path, data).parent / "figures" / "viewpoints.svg").exists()
