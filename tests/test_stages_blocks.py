@@ -247,7 +247,11 @@ def test_the_interior_of_a_block_keeps_order_and_levels(tmp_path: Path) -> None:
     assert own.second is not None
     assert whole.second is not None
     assert own.second.weights == {cell: whole.second.weights[cell] for cell in own.sizes}
-    for more, message in (({}, "no labels in it"), ({"labels": [3, 184]}, "not the labels of 3 cells")):
+    for more, message in (
+        ({}, "no labels in it"),
+        ({"labels": [3, 184]}, "not the labels of 3"),
+        ({"labels": [3, 3, 40_000]}, "not the labels"),
+    ):
         write_set(tmp_path / "other.npz", own.gaussians, 5, own.sizes, **more)
         with pytest.raises(DataError, match=message):
             boundaries.read_block(tmp_path / "other.npz")

@@ -16,7 +16,7 @@ from sagesplat.formats.levels import read_level, read_more, read_second, read_si
 from sagesplat.metrics.image import psnr
 from sagesplat.scene.blocks import Blocks, visible_shares
 from sagesplat.scene.scene import Scene
-from sagesplat.segment.masks import MAX_LABEL_ID
+from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED
 
 SEVERAL = 0.1  # share of what a view sees that is of other blocks, from which on it is a boundary view
 _PAD = 0.25  # of the image beyond its edges: Gaussians with their centre there may reach into it
@@ -61,7 +61,8 @@ def read_block(path: Path) -> BlockLevels:
     """What `write_block` wrote; DataError for anything else."""
     sizes = read_sizes(path)
     labels = read_more(path, "labels")
-    if labels.shape != (len(sizes),) or labels.dtype.kind != "i":
+    possible = labels.dtype.kind == "i" and ((labels >= UNLABELLED) & (labels <= MAX_LABEL_ID)).all()
+    if labels.shape != (len(sizes),) or not possible:
         raise DataError(
             f"{path}: not the labels of {len(sizes)} cells; delete it and run `sagesplat nest` again"
         )
