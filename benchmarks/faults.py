@@ -39,7 +39,7 @@ from sagesplat.output.table import Table
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
 CASES = ("a", "b", "c", "d", "e")
 NODES = 3
-_BEFORE = {"train": "blocks", "nest": "block_categories"}  # the stage that ends before another begins
+_BEFORE = {"train": "blocks", "nest": "train"}  # the stage that ends before another begins
 
 
 def main(

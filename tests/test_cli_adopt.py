@@ -87,7 +87,7 @@ def test_another_splat_replaces_it_only_with_force(finished: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     "words",
     [
-        *(("train", "--force"), ("nest",), ("fuse",), ("lift",), ("block-categories",), ("compare",)),
+        *(("train", "--force"), ("nest",), ("fuse",), ("lift",), ("compare",)),
         *(("report", "--paper"), ("crossview",)),
         ("plan", "--target-ssim", "0.7", "--force"),
     ],

@@ -22,7 +22,6 @@ from sagesplat.adapt.plan import Choice, Plan, Reached
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.io.columns import cell_text
 from sagesplat.output import figures, report_figures
-from sagesplat.output.by_category import merged
 from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands, next_steps
 from sagesplat.output.place_figures import Place
@@ -395,32 +394,6 @@ def test_pictures():
     assert error[1, 1].sum() < 10
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_scene_in_blocks_is_shown_by_category(tmp_path: Path) -> None:
-    data = make(0)
-    names = {3: "grass@0", 7: "grass@1", 9: "vase@1"}
-    path = write_report(tmp_path, dataclasses.replace(data, names=names, categories={3: 3, 7: 3, 9: 9}))
-    page = Page(path)
-    head = page.text[page.text.index("What each category gets") : page.text.index("What each target costs")]
-    assert "grass" in head
-    assert "@" not in head
-    plan = (tmp_path / "tables" / "plan.csv").read_text()
-    assert all(name in plan for name in names.values())
-    sizes = (tmp_path / "tables" / "gaussians_by_level.csv").read_text().splitlines()
-    assert sizes[0].count("grass") == 1
-    row = dict(zip(sizes[0].split(","), sizes[-1].split(","), strict=True))
-    assert int(row["grass"]) == data.counts[3, 3000] + data.counts[7, 3000]
-
-
-def test_parts_are_averaged_over_their_pixels() -> None:
-    rows = [(3, 1, 0, 2.0, 0.5, 0.5, 20.0, 100), (7, 1, 0, 1.0, 0.8, np.nan, 30.0, 300)]
-    one = merged(columns(Observations, rows), {3: 3, 7: 3}, ("level", "view"))
-    assert (len(one), one.label_id[0], one.num_pixels[0], one.distance[0]) == (1, 3, 400, 1.0)
-    assert one.ssim[0] == pytest.approx(0.725)
-    assert one.ssim_eroded[0] == pytest.approx(0.5)
-    assert one.psnr[0] == pytest.approx(-10 * np.log10((1e-2 + 3 * 1e-3) / 4))
-
-
 AWKWARD = (
     *("[/red]", '=HYPERLINK("x")', "$x^2$", "_grass", "a|b & c_%", "日本語", "é", "🚗", "x" * 100, "W" * 99),
     *("a--b-->", "</svg>", "{{ 1 }}", "🚗" * 100, "\\frac{", "__", "%s %d {0}"),
@@ -530,16 +503,3 @@ def test_long_names_have_legends_too(tmp_path, monkeypatch):
     data = led_by_fidelity(panels=1)
     names = dict.fromkeys(data.names, "a category whose name is longer than most of them are")
     assert write_report(tmp_path, dataclasses.replace(data, names=names)).exists()
-
-
-def test_the_map_of_viewpoints_of_a_scene_in_blocks(tmp_path, monkeypatch):
-    """A category's rows are those of all its blocks; the map has a dot for each viewpoint."""
-    save = figures.save_figure
-    only = {"viewpoints": save}
-    monkeypatch.setattr(
-        figures, "save_figure", lambda figure, path, **_: only.get(path.stem, laid_out)(figure, path)
-    )
-    page = whole_page()
-    first, *others = page.drawn
-    data = dataclasses.replace(page, categories=dict.fromkeys(others, first))
-    assert (write_report(tmp_path, data).parent / "figures" / "viewpoints.svg").exists()

@@ -386,7 +386,6 @@ def test_the_ladders_of_a_run_in_blocks_share_its_categories_and_its_training(ca
     work(tmp_path / "run", capture, config)
     more = replace(config, ladder="nested", blocks=BLOCKS)
     again = done(work(tmp_path / "run", capture, more))
-    assert "block_categories" not in again
     assert "train" not in again
     assert again[-1] == "report"
     table = RunDir(tmp_path / "run").adapted / "blocks.csv"

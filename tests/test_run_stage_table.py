@@ -49,7 +49,7 @@ def test_what_follows() -> None:
 def test_the_command_of_a_stage_can_be_typed() -> None:
     commands = {name: command_of(name).split() for name in STAGES}
     assert all(words[0] == "sagesplat" and words[1] in cli.commands() for words in commands.values())
-    assert commands["block_categories"] == ["sagesplat", "block-categories"]
+    assert commands["photo_instances"] == ["sagesplat", "instances"]
     assert command_of("pruned-0.5-600") == "sagesplat compare"
     assert command_of("paper") == "sagesplat report --paper"
 

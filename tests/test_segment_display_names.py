@@ -22,10 +22,6 @@ def test_names_that_become_the_same_stay_as_they_are() -> None:
     assert titles(names) == {1: "wall-other-merged", 2: "wall", 3: "grass", -1: "unlabelled"}
 
 
-def test_categories_of_blocks_keep_their_block() -> None:
-    assert titles({1: "grass-merged@0", 2: "grass-merged@1"}) == {1: "grass@0", 2: "grass@1"}
-
-
 def test_no_two_of_cocos_share_a_title() -> None:
     shown = titles(NAMES).values()
     assert len(set(shown)) == len(NAMES)

@@ -99,11 +99,3 @@ def test_a_category_selects_its_instances_too() -> None:
     assert len(select(g, "chair 2, tree-merged", NAMES)) == 3
     with pytest.raises(LabelError, match="did you mean chair 1"):
         select(g, "chair1", NAMES)
-
-
-def test_in_blocks_a_name_means_all_blocks_of_it() -> None:
-    names = {0: "chair@0", 1: "chair 1@0", 2: "tree@0", 3: "chair@1", 4: "chair 1@1"}
-    parents, g = {1: "chair@0", 4: "chair@1"}, gaussians([0, 1, 2, 3, 4])
-    assert select_mask(g, "chair 1", names, parents).tolist() == [False, True, False, False, True]
-    assert select_mask(g, "chair", names, parents).tolist() == [True, True, False, True, True]
-    assert select_mask(g, "chair@1", names, parents).tolist() == [False, False, False, True, True]

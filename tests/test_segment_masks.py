@@ -12,7 +12,6 @@ from sagesplat.core.errors import LabelError, SceneError
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.undistort import pinhole
 from sagesplat.segment import masks as masks_module
-from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Masks, Taxonomy, mask_path, prepare_folder, read_mask, write_mask
 
@@ -367,9 +366,3 @@ def test_an_accent_in_two_ways_is_one_name(tmp_path):
         imported(scene_of("a.jpg"), tmp_path)
     save(tmp_path / "a.png", IDS, {"labels": {"3": "cafe\u0301", "184": "Tree"}})
     assert imported(scene_of("a.jpg"), tmp_path)[0].taxonomy.names == {3: "caf\u00e9", 184: "Tree"}
-
-
-def test_the_longest_names_have_room_for_a_block(tmp_path):
-    names = BlockCategories(Taxonomy({3: "x" * 100}), 300).names
-    names.write(tmp_path / "labels.json")
-    assert Taxonomy.read(tmp_path / "labels.json") == names

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_run_executor import Shuffled
 
+from sagesplat.adapt.cells import read_cells
 from sagesplat.adapt.ladder import read_ladder, read_prefixes
 from sagesplat.core.config import (
     BlocksConfig,
@@ -25,10 +26,12 @@ from sagesplat.core.config import (
     SceneConfig,
     TrainConfig,
 )
-from sagesplat.core.errors import LabelError, RunError, SceneError
+from sagesplat.core.errors import DataError, RunError, SceneError
 from sagesplat.core.events import Event, StageDone, StageSkipped
+from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.demo.capture import make_capture
-from sagesplat.formats.label_edits import Hide, LabelEdits, dump_edits, ladder_hash
+from sagesplat.formats.label_edits import Hide, LabelEdits, Merge, dump_edits, ladder_hash
+from sagesplat.formats.levels import write_set
 from sagesplat.io.files import read_json, write_text
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -44,8 +47,7 @@ from sagesplat.scene.blocks import (
 )
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
-from sagesplat.segment.block_categories import BlockCategories, category_of, split_name
-from sagesplat.segment.masks import Masks, Taxonomy
+from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.bundle_contents import bundle_contents
 from sagesplat.stages.instances import make_instances
@@ -222,45 +224,49 @@ def test_broken_stored_scenes(tmp_path: Path) -> None:
         read_scene(path)
 
 
-def test_parts_have_names_of_their_own() -> None:
-    parts = BlockCategories(Taxonomy({3: "car", 184: "tree-merged"}), 3)
-    ids = parts.ids(np.array([-1, 3, 184, 184]), np.array([0, 0, 1, 2]))
-    assert [parts.names.name(i) for i in ids.tolist()] == [
-        "unlabelled@0", "car@0", "tree-merged@1", "tree-merged@2",
-    ]  # fmt: skip
-    assert parts.block_of(ids).tolist() == [0, 0, 1, 2]
-    assert len(set(parts.names.names)) == 9
-    assert split_name("tree-merged@12") == ("tree-merged", 12)
-    assert split_name("a@b") == ("a@b", None)
-    assert category_of("grass") == "grass"
-    with pytest.raises(LabelError, match="are too many; choose fewer"):
-        BlockCategories(Taxonomy({i: str(i) for i in range(100)}), 400)
+def block_levels(count: int, seed: int, label_of: dict[int, int]) -> boundaries.BlockLevels:
+    """Levels of as many Gaussians in these cells, with second opacities."""
+    cells = torch.tensor(sorted(label_of), dtype=torch.int16).repeat_interleave(count // len(label_of))
+    g = replace(random_gaussians(len(cells), seed=seed), label_ids=cells)
+    sizes = {cell: (2, 7, n) for cell, n in g.counts().items()}
+    second = SecondOpacities.of_levels(g.logit_opacities - 1, sizes)
+    return boundaries.BlockLevels(g, sizes, label_of, second)
 
 
-def test_core_keeps_order_and_levels() -> None:
-    scene = street(places=2)
-    blocks = split(scene, 2)
-    g = random_gaussians(60, seed=3)
-    g = g.select(torch.argsort(g.label_ids, stable=True))
-    spots = torch.from_numpy(scene.points.xyz[np.random.default_rng(0).choice(400, 60)])
-    g = replace(g, means=spots)
-    sizes = {label: (2, 7, n) for label, n in g.counts().items()}
-    parts = BlockCategories(Taxonomy({3: "car", 184: "tree-merged"}), 2)
-    cores = [boundaries.interior(g, blocks, parts, b) for b in range(2)]
-    assert sum(len(c[0]) for c in cores) == 60
-    for block, (core, inside) in enumerate(cores):
-        levels = boundaries.interior_sizes(g.label_ids.numpy(), inside, sizes, parts, block)
-        rows = np.flatnonzero(blocks.of(g.means.numpy()) == block)
-        np.testing.assert_array_equal(np.flatnonzero(inside), rows)
-        np.testing.assert_array_equal(core.means, g.means[rows])  # in the order of the whole
-        assert core.counts() == {part: n[-1] for part, n in levels.items()}
-        for label, (low, middle, _) in sizes.items():
-            mine = rows[g.label_ids.numpy()[rows] == label]
-            first = np.flatnonzero(g.label_ids.numpy() == label)[0]
-            part = int(parts.ids(np.array(label), block))
-            if len(mine):
-                expected = [max(1, int((mine < first + n).sum())) for n in (low, middle)]
-                assert list(levels[part][:2]) == expected
+def test_the_interior_of_a_block_keeps_order_and_levels(tmp_path: Path) -> None:
+    whole = block_levels(60, 3, {0: -1, 1: 3, 2: 3, 3: 184})
+    inside = np.random.default_rng(0).random(60) < 0.6
+    inside[:15] = False  # all of a cell
+    boundaries.write_block(tmp_path / "interior.npz", whole.select(inside), 5)
+    own = boundaries.read_block(tmp_path / "interior.npz")
+    torch.testing.assert_close(own.gaussians.means, whole.gaussians.means[torch.from_numpy(inside)])
+    assert own.label_of == {1: 3, 2: 3, 3: 184}
+    for cell, (low, middle, last) in own.sizes.items():
+        mine = inside[15 * cell : 15 * cell + 15]
+        assert (low, middle, last) == (max(1, mine[:2].sum()), max(1, mine[:7].sum()), mine.sum())
+    assert own.second is not None
+    assert whole.second is not None
+    assert own.second.weights == {cell: whole.second.weights[cell] for cell in own.sizes}
+    for more, message in (
+        ({}, "no labels in it"),
+        ({"labels": [3, 184]}, "not the labels of 3"),
+        ({"labels": [3, 3, 40_000]}, "not the labels"),
+    ):
+        write_set(tmp_path / "other.npz", own.gaussians, 5, own.sizes, **more)
+        with pytest.raises(DataError, match=message):
+            boundaries.read_block(tmp_path / "other.npz")
+
+
+def test_cells_of_merged_blocks_are_numbered_by_category() -> None:
+    parts = block_levels(20, 1, {0: 3, 1: 184}), block_levels(30, 2, {0: -1, 1: 3, 2: 3})
+    both = boundaries.merged(parts)
+    assert both.label_of == {0: -1, 1: 3, 2: 3, 3: 3, 4: 184}
+    assert both.gaussians.label_ids.tolist() == [1] * 10 + [4] * 10 + [0] * 10 + [2] * 10 + [3] * 10
+    assert both.sizes == {1: (2, 7, 10), 4: (2, 7, 10), 0: (2, 7, 10), 2: (2, 7, 10), 3: (2, 7, 10)}
+    assert both.second is not None
+    assert set(both.second.weights) == set(both.label_of)
+    torch.testing.assert_close(both.full.logit_opacities, both.gaussians.logit_opacities - 1)
+    torch.testing.assert_close(both.gaussians.means[20:], parts[1].gaussians.means)
 
 
 def test_bands_are_measured_apart() -> None:
@@ -315,41 +321,60 @@ def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+def blocks_of_cells(run: RunDir) -> dict[int, int]:
+    """The block that each cell of a run is of: where most of its Gaussians are."""
+    blocks, g = read_blocks(run.division), read_prefixes(run.prefixes).gaussians
+    at, found = blocks.of(g.means.numpy()), {}
+    for cell in g.counts():
+        found[cell] = int(np.bincount(at[g.label_ids.numpy() == cell]).argmax())
+    return found
+
+
 def test_a_run_in_blocks(finished: Path, capture: Path) -> None:
     run = RunDir(finished)
-    names = Taxonomy.read(run.block_categories / "labels.json").names
-    ladder, snapshots = read_prefixes(run.prefixes), read_ladder(run.levels)
+    names = Taxonomy.read(run.masks / "labels.json").names
+    ladder, snapshots, cells = read_prefixes(run.prefixes), read_ladder(run.levels), read_cells(run.cells)
     assert snapshots.levels == [20, 40]
-    assert set(ladder.sizes) <= set(names)
-    assert {split_name(names[label])[1] for label in ladder.sizes} == {0, 1}
-    # every Gaussian is in the block that its name says: those that were tuned may have moved a little
-    blocks = read_blocks(run.division)
-    g = snapshots.load(40)
-    of_name = np.array([split_name(names[label])[1] for label in g.label_ids.tolist()])
-    np.testing.assert_array_equal(blocks.of(g.means.numpy()), of_name)
+    assert {label for label, _ in snapshots.counts} <= {-1, *names}
+    assert set(ladder.sizes) == set(cells.label_of)
+    assert list(cells.labels) == sorted(cells.labels)
+    # each cell is in one block: those that were tuned may have moved a little
+    blocks, of_cells = read_blocks(run.division), blocks_of_cells(run)
+    assert len({(label, of_cells[cell]) for cell, label in cells.label_of.items()}) > len(set(cells.labels))
     g = ladder.gaussians
-    of_name = np.array([split_name(names[label])[1] for label in g.label_ids.tolist()])
-    beyond = blocks.to_border(g.means.numpy())[blocks.of(g.means.numpy()) != of_name]
+    own = np.array([of_cells[cell] for cell in g.label_ids.tolist()])
+    beyond = blocks.to_border(g.means.numpy())[blocks.of(g.means.numpy()) != own]
     assert len(beyond) < 0.05 * len(g)
     assert (beyond < blocks.margin / 2).all()
-    # pixels keep their category
-    scene = load_scene(capture)
-    parts, before = (Masks(f, Taxonomy.read(f / "labels.json")) for f in (run.block_categories, run.masks))
-    for view in scene.views[:3]:
-        of_parts = [category_of(names[i]) for i in parts[view].ravel()[::50].tolist()]
-        assert of_parts == [before.taxonomy.name(i) for i in before[view].ravel()[::50].tolist()]
-    assert {row["label_id"] for row in read_json(run.increments / "index.json")["chunks"]} == set(
-        ladder.sizes
-    )
+    # a category is one thing: one file, one model, one promise
+    chunks = read_json(run.increments / "index.json")["chunks"]
+    assert {row["cell"] for row in chunks} == set(ladder.sizes)
+    assert len({row["uri"] for row in chunks}) == len(set(cells.labels))
+    assert set(Job(run, print).names()) == {-1, *names}
+    contents = bundle_contents(Job(run, print), g, cells, False)
+    assert len({one.title for one in contents.categories}) == len(contents.categories)
     assert (run.adapted / "borders.csv").read_text().count("\n") == 3
     assert "| block |" in (run.adapted / "blocks.md").read_text()
     assert read_json(run.plan)["scene"]
 
 
+@pytest.mark.slow
+def test_blocks_share_the_cells_that_are_wanted(finished: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(finished, path)
+    few = replace(CONFIG.nest, steps=8, levels=2, base_share=0.0)
+    found = []
+    for wanted in (0, 24):
+        nest_scene(job_of(path, force=True), replace(few, cells=wanted), 0)
+        found.append(len(read_cells(RunDir(path).cells).ids))
+    pairs, cells = found
+    assert pairs < cells <= 24 + pairs
+
+
 def test_a_run_in_blocks_is_done_once(finished: Path, capture: Path) -> None:
     events = run_in_blocks(capture, finished)
     assert not [e for e in events if isinstance(e, StageDone)]
-    assert sum(isinstance(e, StageSkipped) for e in events) == 16
+    assert sum(isinstance(e, StageSkipped) for e in events) == 15
 
 
 @pytest.mark.slow
@@ -370,35 +395,24 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     few = replace(CONFIG.nest, steps=4, levels=2, base_share=0.0)
     nest_scene(job_of(path, force=True), few, 0)
     job = job_of(path)
-    names, ladder = job.names(), job.by_cell
-    found = {split_name(names[label]) for label in ladder.sizes}
-    assert {("potted plant 1", 0), ("dining table", 0), ("dining table", 1)} <= found
+    names, label_of, blocks = job.names(), job.cells.label_of, blocks_of_cells(job.run)
+    found = {(names[label], blocks[cell]) for cell, label in label_of.items()}
+    assert {"potted plant 1", "dining table"} <= {name for name, _ in found}
     assert {block for name, block in found if name in job.parents} == {0, 1}
-    # every Gaussian is in the block that its name says
-    blocks = read_blocks(job.run.division)
-    means = ladder.gaussians.means.numpy()
-    of_name = np.array([split_name(names[label])[1] for label in ladder.gaussians.label_ids.tolist()])
-    beyond = blocks.to_border(means)[blocks.of(means) != of_name]
-    assert (beyond < blocks.margin / 2).all()
-    # pixels keep block and category
-    categories = Masks(job.run.block_categories, Taxonomy.read(job.run.block_categories / "labels.json"))
+    # pixels keep their category
     view = job.scene.views[0]
-    for was, now in zip(
-        categories[view].ravel().tolist(), job.level_masks[view].ravel().tolist(), strict=True
-    ):
-        name, block = split_name(names[now])
-        assert (job.parents.get(name, name), block) == split_name(categories.taxonomy.name(was))
-    # a category means all its instances in all blocks, an instance all its blocks
+    was, now = job.category_masks[view], job.level_masks[view]
+    parents = [job.parents.get(names[i], names[i]) for i in now.ravel().tolist()]
+    assert parents == [names[i] for i in was.ravel().tolist()]
+    # a category means all its instances
     plants = {label for label, name in names.items() if name.startswith("potted plant")}
     assert set(labels_named(job, ["potted plant"])) == plants
-    assert [names[i] for i in labels_named(job, ["potted plant 1"])] == [
-        "potted plant 1@0", "potted plant 1@1",
-    ]  # fmt: skip
-    assert {job.parents_by_id.get(i) for i in plants} == {None, "potted plant@0", "potted plant@1"}
+    assert [names[i] for i in labels_named(job, ["potted plant 1"])] == ["potted plant 1"]
+    assert {job.parents_by_id.get(i) for i in plants} <= {None, "potted plant"}
     # the viewer's tree: category, instance
-    contents = bundle_contents(job, ladder.gaussians, job.cells, False)
+    contents = bundle_contents(job, job.by_cell.gaussians, job.cells, False)
     tree = {(c.parent, c.name) for c in contents.categories}
-    assert {("potted plant", "potted plant 1@0"), (None, "dining table@1")} <= tree
+    assert {("potted plant", "potted plant 1"), (None, "dining table")} <= tree
     # snapshots have no instances, and they can be folded back
     assert Job(RunDir(path, "snapshots"), print).names() == before
     assert live_bundle(job_of(path), tmp_path / "live", a_viewer(tmp_path))
@@ -406,19 +420,22 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     assert {(one["id"], one["name"]) for one in live} <= set(before.items())
     make_instances(job_of(path, force=True), MasksConfig(), LabelsConfig())
     assert job_of(path).names() == before
-    assert not job_of(path).run.block_instances.exists()
 
 
 @pytest.mark.slow
-def test_categories_of_blocks_can_be_hidden(finished: Path, tmp_path: Path) -> None:
+def test_categories_of_blocks_can_be_edited(finished: Path, tmp_path: Path) -> None:
     job = job_of(finished)
-    edits = LabelEdits(ladder_hash(increments_of(job), job.names()), (Hide("dining table@0", True),))
-    (tmp_path / "labels.edit.json").write_bytes(dump_edits(edits))
+    ids = {name: label for label, name in job.names().items()}
+    edits = (Hide("dining table", True), Merge("vase", "potted plant"))
+    (tmp_path / "labels.edit.json").write_bytes(
+        dump_edits(LabelEdits(ladder_hash(increments_of(job), job.names()), edits))
+    )
     made = apply_labels(job, tmp_path / "labels.edit.json", tmp_path / "out", viewer=a_viewer(tmp_path))
     labels = {one["name"]: one for one in read_json(made.bundle.path / "manifest.json")["labels"]}
-    assert labels["dining table@0"]["hidden"]
-    assert "hidden" not in labels["dining table@1"]
-    assert job_of(made.path).names() == job.names()
+    assert labels["dining table"]["hidden"]
+    before = [label for label in job.cells.labels if label in (ids["vase"], ids["potted plant"])]
+    assert len(labels["potted plant"]["cells"]) == len(before)
+    assert "vase" not in labels
 
 
 def test_a_run_keeps_its_blocks(finished: Path, capture: Path) -> None:

@@ -410,19 +410,3 @@ def test_a_run_as_one_page(run: Path, tmp_path: Path) -> None:
     assert out.read_text().count('data-uri="chunks/') == len({one.uri for one in listed})
     with pytest.raises(RunError, match=r"name that ends in \.html"):
         bundle(job, tmp_path / "folder", single_file=True)
-
-
-def test_parts_of_blocks_are_told_by_category(run: Path, tmp_path: Path, viewer: Path) -> None:
-    job, out = job_of(run), tmp_path / "out"
-    job.run.block_categories.mkdir(exist_ok=True)
-    shutil.copy(job.run.labels, job.run.block_category_labels)
-    write_json(job.run.block_categories / "labels.json", {"labels": {"3": "car@0", "184": "car@2"}})
-    bundle(job, out, weights={"car": 3, "car@2": 5}, always=["car"], viewer=viewer)
-    labels = {label["id"]: label for label in manifest_of(out)["labels"]}
-    a, b = labels[3], labels[184]
-    assert (a["name"], b["name"]) == ("car@0", "car@2")
-    assert (a["title"], b["title"]) == ("car (block 0)", "car (block 2)")
-    assert a["color"] == b["color"]
-    assert (a["weight"], b["weight"], a["always"], b["always"]) == (3, 5, True, True)
-    with pytest.raises(RunError, match=r"bike: no such category; there are car.*NAME@BLOCK"):
-        bundle(job, out, always=["bike"], viewer=viewer)

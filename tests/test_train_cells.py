@@ -35,6 +35,17 @@ def test_every_gaussian_is_in_a_cell_of_its_category():
     assert same == label_of
 
 
+def test_gaussians_outside_of_a_block_join_the_cells_inside():
+    means, labels = cloud()
+    inside = means[:, 0] < 0
+    cells, label_of = split_cells(means, labels, 20, inside)
+    assert 15 <= len(label_of) <= 25
+    assert np.bincount(cells[inside], minlength=len(label_of)).min() >= FEWEST // 2
+    assert [label_of[cell] for cell in cells.tolist()] == labels.tolist()
+    _, without = split_cells(means, labels, 20, inside & (labels != 12))
+    assert list(without.values()).count(12) == 1  # outside only
+
+
 def test_cells_are_compact():
     means, labels = cloud()
     cells, label_of = split_cells(means, labels, 20)

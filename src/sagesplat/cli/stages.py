@@ -254,15 +254,6 @@ def clean(
 
 
 @command
-def block_categories(run: Run, machine: Annotated[Compute, Flat] = Compute()) -> None:
-    """Render the label images of a scene in blocks; each (block, category) pair becomes a category."""
-    from sagesplat.stages import blocks
-
-    with open_job(run, machine) as job:
-        blocks.label_block_categories(job)
-
-
-@command
 def nest(
     run: Run,
     nest: NestConfig = NestConfig(),

@@ -202,8 +202,8 @@ class NestConfig:
     base_steps: PositiveInt31 = 1600
     """Training steps of the base model, which begins with the trained model, merged to that size."""
     cells: Annotated[int, Meta(ge=0, le=4096)] | Literal["auto"] = "auto"
-    """Parts of categories by place, in all, that have levels of their own; 0: each category is one (auto: by
-    the number of Gaussians, at most 64)."""
+    """Parts of categories by place, in all, that have levels of their own, at least one in each block;
+    0: each category is one (auto: by the number of Gaussians, at most 64)."""
     rate_weight: NotNegative = 6e-4
     """Loss per bit that the SH coefficients of a Gaussian take in a coded stream, on average; 0: only how it
     looks counts."""

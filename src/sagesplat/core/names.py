@@ -16,16 +16,16 @@ _SLUG = 60  # characters of a slug, at most
 _FILLERS = "\u115f\u1160\u2800\u3164\uffa0"  # letters and symbols that look like a space
 
 
-def checked(name: object, length: int = LENGTH) -> str:
+def checked(name: object) -> str:
     """The name in Unicode's composed form (NFC).
 
-    Raises ValueError, which says why, for what is no text, blank, longer than `length` characters or has a
+    Raises ValueError, which says why, for what is no text, blank, longer than `LENGTH` characters or has a
     space at an end; for control characters, lone surrogates, line separators, and for invisible characters
     such as those that reverse the direction of writing.
     """
     if not isinstance(name, str):
         raise ValueError("it is no text")
-    if len(name) > 4 * length:  # composing never makes it so much shorter
+    if len(name) > 4 * LENGTH:  # composing never makes it so much shorter
         raise ValueError(f"it has {len(name)} characters")
     name = composed(name)
     _check_characters(name)
@@ -33,7 +33,7 @@ def checked(name: object, length: int = LENGTH) -> str:
         raise ValueError("it is blank")
     if name != name.strip():
         raise ValueError("it begins or ends with a space")
-    if len(name) > length:
+    if len(name) > LENGTH:
         raise ValueError(f"it has {len(name)} characters")
     return name
 

@@ -3,7 +3,7 @@
 import base64
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -12,19 +12,17 @@ from jinja2 import Environment, StrictUndefined, Template
 from PIL import Image
 
 from sagesplat import __version__
-from sagesplat.adapt.evaluate import COLOURS, UNIFORM, Evaluation
+from sagesplat.adapt.evaluate import COLOURS, Evaluation
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.plan import Choice, Plan, quality_title
 from sagesplat.core.qr import qr_address
 from sagesplat.io.files import write_text
 from sagesplat.output import figures, tables
-from sagesplat.output.by_category import Categories, merged, merged_counts, merged_plan, relabelled
 from sagesplat.output.figures import Colours, Panel
 from sagesplat.output.report_data import ReportData, main_plan, nearest, sizes_of, steps_of
 from sagesplat.output.report_figures import report_figures
 from sagesplat.output.table import Table
 from sagesplat.output.tables import MB, bytes_of, name_of
-from sagesplat.segment.block_categories import category_of
 
 PICTURE_WIDTH = 1400  # pixels of a picture inside the page; the files beside it keep their size
 TABLE_ROWS = 200  # of a table inside the page; the file beside it has all
@@ -34,35 +32,32 @@ def write_report(folder: Path, data: ReportData) -> Path:
     """Write `folder`/index.html, figures/*.png|svg and tables/*.csv; the path of the page comes back.
 
     Every number is computed from `data`; evaluation rows of other views than the test views do not count, and
-    sections without data (no test views, no panels) are left out. `data.plans` must not be empty. A scene in
-    blocks is shown by category; what was fitted and planned per block is in the tables.
+    sections without data (no test views, no panels) are left out. `data.plans` must not be empty.
     """
     unseen = np.isin(data.evaluation.view, data.test_views)
-    per_block = replace(data, evaluation=data.evaluation.select(unseen))
-    data, promises = by_category(per_block), relabelled(per_block.evaluation, per_block.categories)
+    data = replace(data, evaluation=data.evaluation.select(unseen))
     labels = tables.by_size(data.counts)
     beside = None if data.ssim_target is None else nearest(data, "ssim", data.ssim_target)
-    drawn = report_figures(data, labels, per_block, promises)
+    drawn = report_figures(data, labels)
     plots = {
         name: (title, _address(figures.save_figure(figure, folder / "figures" / name), "image/svg+xml"))
         for name, title, figure in drawn
     }
-    sheets = dict(_tables(data, labels, per_block, promises))
+    sheets = dict(_tables(data, labels))
     for name, table in sheets.items():
         table.write_csv(folder / "tables" / f"{name}.csv")
-    per_block.observations.write_csv(folder / "tables" / "observations.csv")
-    per_block.evaluation.write_csv(folder / "tables" / "evaluation_rows.csv")
+    data.observations.write_csv(folder / "tables" / "observations.csv")
+    data.evaluation.write_csv(folder / "tables" / "evaluation_rows.csv")
     for number, panel in enumerate(data.panels):
         strip = figures.panel_strip(panel, data.colours)
         figures.save_figure(strip, folder / "figures" / f"panel_{number}", svg=False)
     page = template(Path(__file__).with_name("report.html.j2")).render(
         data=data,
         version=__version__,
-        headline=_headline(data, promises),
-        categories=_categories(data, main_plan(data), labels, promises),
+        headline=_headline(data),
+        categories=_categories(data, main_plan(data), labels),
         beside=beside,
-        beside_categories=_categories(data, beside, labels, promises) if beside else [],
-        num_parts=len(per_block.categories),
+        beside_categories=_categories(data, beside, labels) if beside else [],
         table_rows=TABLE_ROWS,
         plots=plots,
         steps=steps_of(data),
@@ -78,38 +73,6 @@ def write_report(folder: Path, data: ReportData) -> Path:
     return folder / "index.html"
 
 
-def by_category(data: ReportData) -> ReportData:
-    """The same by category instead of per-block category, models excepted."""
-    if not data.categories:
-        return data
-    to = data.categories
-    return replace(
-        data,
-        observations=merged(data.observations, to, ("level", "view")),
-        counts=merged_counts(data.counts, to),
-        sizes=None if data.sizes is None else merged_counts(data.sizes, to),
-        plans=[merged_plan(plan, to) for plan in data.plans],
-        evaluation=_merged_evaluation(data.evaluation, to),
-        drawn=_pooled(data.drawn, to),
-        names={label: category_of(name) if label in to else name for label, name in data.names.items()},
-    )
-
-
-def _pooled(drawn: Mapping[int, np.ndarray], to: Categories) -> dict[int, np.ndarray]:
-    """By category what all its blocks measure."""
-    found: dict[int, list[np.ndarray]] = {}
-    for label, values in drawn.items():
-        found.setdefault(to.get(label, label), []).append(values)
-    return {label: np.concatenate(parts) for label, parts in found.items()}
-
-
-def _merged_evaluation(rows: Evaluation, to: Categories) -> Evaluation:
-    """The rows by category; those of whole images at one level stay as they are."""
-    uniform = rows.label_id == UNIFORM
-    parts = [merged(rows.select(~uniform), to, ("quality", "target", "view")), rows.select(uniform)]
-    return Evaluation.joined(parts)
-
-
 def template(path: Path) -> Template:
     """A page's template."""
     environment = Environment(
@@ -118,7 +81,7 @@ def template(path: Path) -> Template:
     return environment.from_string(path.read_text("utf-8"))
 
 
-def _headline(data: ReportData, promises: Evaluation) -> dict:
+def _headline(data: ReportData) -> dict:
     """The figures at the top of the page, all measured."""
     plan = main_plan(data)
     full = sum(tables.last_counts(data.counts).values())
@@ -143,7 +106,7 @@ def _headline(data: ReportData, promises: Evaluation) -> dict:
         "full_psnr": tables.mean(whole.full_psnr),
         **{f.name: tables.mean(getattr(whole, f.name)) for f in fields(whole) if f.name.endswith(COLOURS)},
         "num_views": len(np.unique(whole.view)),
-        "kept": _kept(plan, promises.of(plan)),
+        "kept": _kept(plan, rows),
         "least": min(shares, key=lambda share: share.share) if shares else None,
         "num_drawn": max((share.num_views for share in shares), default=0),
         "infeasible": [c for c in plan.choices if c.status == "infeasible"],
@@ -162,11 +125,11 @@ def _kept(plan: Plan, rows: Evaluation) -> tables.Kept:
     return tables.promise_kept(rows.of_own_quality())
 
 
-def _categories(data: ReportData, plan: Plan, labels: Sequence[int], promises: Evaluation) -> list[dict]:
+def _categories(data: ReportData, plan: Plan, labels: Sequence[int]) -> list[dict]:
     """A line of one of the page's tables of categories per label, the largest first."""
     sizes = tables.last_counts(sizes_of(data))
     chosen: dict[int, Choice] = {choice.label_id: choice for choice in plan.choices}
-    at_target, promised = data.evaluation.of(plan), promises.of(plan)
+    at_target = data.evaluation.of(plan)
     lines = []
     for label_id in labels:
         rows = at_target.select(at_target.label_id == label_id)
@@ -182,29 +145,29 @@ def _categories(data: ReportData, plan: Plan, labels: Sequence[int], promises: E
                 "fidelity": tables.mean(rows.fidelity),
                 "measured": tables.mean(rows.ssim),
                 "full_ssim": tables.mean(rows.full_ssim),
-                "kept": _kept(plan, promised.select(promised.label_id == label_id)),
+                "kept": _kept(plan, rows),
             }
         )
     return lines
 
 
-def _tables(data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation):
+def _tables(data: ReportData, labels: Sequence[int]):
     """(file name, Table) of every table that the data allow."""
     names = data.names
-    yield "plan", tables.plan_table(main_plan(per_block), per_block.counts, per_block.names)
+    yield "plan", tables.plan_table(main_plan(data), data.counts, data.names)
     if data.ssim_target is not None:
-        beside = nearest(per_block, "ssim", data.ssim_target)
-        yield "plan_ssim", tables.plan_table(beside, per_block.counts, per_block.names)
+        beside = nearest(data, "ssim", data.ssim_target)
+        yield "plan_ssim", tables.plan_table(beside, data.counts, data.names)
     yield "size_by_target", tables.targets_table(data.plans, data.counts, labels, names, data.sizes)
     if len(data.evaluation):
-        yield "evaluation", tables.evaluation_table(promises, labels, names)
+        yield "evaluation", tables.evaluation_table(data.evaluation, labels, names)
     yield "gaussians_by_level", tables.counts_table(data.counts, labels, names)
     for which, views in (("training", data.train_views), ("test", data.test_views)):
         if len(views):
             table = tables.quality_table(data.observations, views, labels, names, which)
             yield f"ssim_by_level_{which}", table
     if data.models:
-        yield "models", tables.models_table(data.models, per_block.names)
+        yield "models", tables.models_table(data.models, data.names)
     if data.panels:
         rows = [(p.name, p.ssim, p.psnr, p.full_ssim, p.full_psnr) for p in data.panels]
         header = ("view", "SSIM", "PSNR", "full model SSIM", "full model PSNR")

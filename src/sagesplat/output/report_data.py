@@ -12,7 +12,6 @@ from sagesplat.adapt.observe import Observations
 from sagesplat.adapt.plan import Counts, Plan
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN
-from sagesplat.output.by_category import Categories
 from sagesplat.output.figures import Colours, Panel, Sizes
 from sagesplat.output.next_steps import Commands, NextStep, next_steps
 from sagesplat.output.place_figures import Place
@@ -60,7 +59,6 @@ class ReportData:
     photos: bool = True  # False: renders of a splat that somebody else trained
     adopted: Facts = ()  # how such a splat was looked at, and how its levels were made
     viewpoints: UInt8[np.ndarray, "H W 3"] | None = None  # what its viewpoints see
-    categories: Categories = field(default_factory=dict)  # of per-block categories
     noticed: Sequence[str] = ()  # what the run noticed, and dealt with, in words
     commands: Commands | None = None  # what commands on the run name
     can_view: bool = False  # whether `sagesplat view` shows the run

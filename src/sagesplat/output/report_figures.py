@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from sagesplat.adapt.evaluate import Evaluation
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.plan import Plan, quality_title
 from sagesplat.output import figures, place_figures, tables
@@ -17,9 +16,7 @@ FIT_LEVELS = 4  # levels drawn in the figure of SSIM over distance
 FIT_LABELS = 9  # labels drawn there, the largest
 
 
-def report_figures(
-    data: ReportData, labels: Sequence[int], per_block: ReportData, promises: Evaluation
-) -> Iterator[tuple[str, str, figures.Figure]]:
+def report_figures(data: ReportData, labels: Sequence[int]) -> Iterator[tuple[str, str, figures.Figure]]:
     """(file name, title, Figure) of every plot that the data allow."""
     names, colours, seen, quality = data.names, data.colours, data.observations, data.quality
     unit = "bytes to send (MB)" if data.sizes else figures.RAW
@@ -40,7 +37,7 @@ def report_figures(
             ),
         )
     if data.drawn and data.drawn_at is not None:
-        share = _reached(per_block, main_plan(per_block))  # rows of a category are those of all its blocks
+        share = _reached(data, main_plan(data))
         yield "viewpoints", "Map of the drawn viewpoints", place_figures.viewpoint_map(data.drawn_at, share)
     if len(data.evaluation):
         yield (
@@ -59,7 +56,7 @@ def report_figures(
         yield (
             "asked_and_measured",
             f"Target and measured {quality_title(quality)} on unseen views",
-            figures.asked_and_measured(promises, labels, names, colours, quality),
+            figures.asked_and_measured(data.evaluation, labels, names, colours, quality),
         )
     if len(seen):
         yield (
@@ -73,14 +70,14 @@ def report_figures(
         levels = sorted({level for _, level in data.models if level not in data.recovering})
         picked = np.geomspace(1, max(len(levels), 1), FIT_LEVELS).round().astype(int) - 1
         shown = [levels[i] for i in np.unique(picked)] if levels else []
-        fitted = tables.by_size(per_block.counts)
+        fitted = tables.by_size(data.counts)
         few = fitted[:FIT_LABELS]
         most = f", the {len(few)} largest of {len(fitted)}" if len(few) < len(fitted) else ""
         yield (
             "ssim_over_distance",
             f"SSIM over distance and its model{most}",
             figures.ssim_over_distance(
-                per_block.observations, data.train_views, few, per_block.names, colours, data.models, shown
+                data.observations, data.train_views, few, data.names, colours, data.models, shown
             ),
         )
 

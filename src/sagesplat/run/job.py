@@ -32,7 +32,6 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
 from sagesplat.scene.refined import read_refined, with_cameras
 from sagesplat.scene.scene import Scene
-from sagesplat.segment.block_categories import per_block_name, split_name
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Masks, Taxonomy
 from sagesplat.segment.parents import read_parents
@@ -139,19 +138,12 @@ class Job:
         return self.run.division.exists()
 
     @property
-    def has_block_categories(self) -> bool:
-        """Whether each category in each block is one of its own by now."""
-        return (self.run.block_labels / "labels.json").exists()
-
-    @property
     def taxonomy(self) -> Taxonomy:
         """The names of the run's categories."""
         return Taxonomy.read(self._labels)
 
     @property
     def _labels(self) -> Path:
-        if self.has_block_categories:
-            return self.run.block_labels / "labels.json"
         return (self.run.instances if self.run.has_instances else self.run.masks) / "labels.json"
 
     @property
@@ -176,18 +168,13 @@ class Job:
 
     @property
     def parents_by_id(self) -> dict[int, str]:
-        """The category of each instance, by the instance's id: in a scene in blocks that of the block."""
-        split = split_name if self.has_block_categories else lambda name: (name, None)
-        found, parents = {}, self.parents
-        for label, name in self.names().items():
-            category, block = split(name)
-            if category in parents:
-                found[label] = per_block_name(parents[category], block)
-        return found
+        """The category of each instance, by the instance's id."""
+        parents = self.parents
+        return {label: parents[name] for label, name in self.names().items() if name in parents}
 
     @property
-    def whole_masks(self) -> Masks:
-        """The label images of the scene as one: with its instances, if they were asked for."""
+    def level_masks(self) -> Masks:
+        """The label images of what the levels are of: with instances, if they were asked for."""
         instances = self.run.instances
         if self.run.has_instances:
             return Masks(instances, Taxonomy.read(instances / "labels.json"))
@@ -198,11 +185,6 @@ class Job:
         """The label images that all views agreed on, if they were asked to."""
         fused = self.run.fused
         return Masks(fused, self.masks.taxonomy) if (fused / "labels.json").exists() else self.masks
-
-    @property
-    def level_masks(self) -> Masks:
-        """The same, of the parts that a scene in blocks has."""
-        return Masks(self.run.block_labels, self.taxonomy) if self.has_block_categories else self.whole_masks
 
     @property
     def sky(self) -> Sky | None:
@@ -225,7 +207,6 @@ class Job:
         return self._lifted(self.run.labels).initial_ids
 
     def _lifted(self, path: Path) -> LiftedLabels:
-        path = self.run.block_category_labels if self.has_block_categories else path
         lifted = LiftedLabels.read(path, len(self.scene.points.xyz))
         ids = np.flatnonzero(np.bincount(lifted.label_ids.astype(np.int64) + 1)) - 1
         self.check_named(path, ids)

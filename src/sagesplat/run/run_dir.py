@@ -86,9 +86,6 @@ class RunDir:
     # a large scene
     blocks = _In("blocks")  # the run folders of the blocks
     division = _In("blocks.json", "blocks")  # the blocks, and what each has
-    block_categories = _In("block_categories")  # label images of (block, category) pairs, and their points
-    block_instances = _In("block_instances")  # the same of instances, where some were asked for
-    block_category_labels = _In("labels.npz", "block_labels")  # part of each SfM point
     interior = _In("interior.npz", "adapted")  # of a block: what it adds to the nested ladder of the whole
     tuned_interior = _In("tuned_interior.npz", "adapted")  # the same, tuned along the block's borders
 
@@ -135,11 +132,6 @@ class RunDir:
     def has_instances(self) -> bool:
         """Whether instances are categories of their own: in nested levels alone."""
         return self.ladder == "nested" and (self.instances / "labels.json").exists()
-
-    @property
-    def block_labels(self) -> Path:
-        """Which (block, category) pairs the levels are of."""
-        return self.block_instances if self.has_instances else self.block_categories
 
     def provenance(self, stage: str) -> Path:
         """What a stage's result was made from."""

@@ -3,8 +3,6 @@
 from collections import Counter
 from collections.abc import Collection, Mapping
 
-from sagesplat.segment.block_categories import split_name
-
 _SUFFIXES = ("-merged", "-other", "-stuff")  # of COCO's panoptic names
 
 
@@ -31,20 +29,12 @@ def meant(typed: str, names: Collection[str]) -> str:
     """The name that was typed: it itself, or the only one that people see so; else what was typed."""
     if typed in names:
         return typed
-    found = [name for name in names if _short(name) == typed]
+    found = [name for name in names if title_of(name) == typed]
     return found[0] if len(found) == 1 else typed
 
 
 def titles(names: Mapping[int, str]) -> dict[int, str]:
-    """Names for people by label id; names whose short forms are the same keep their full ones.
-
-    The categories of blocks keep their block: grass@2 for grass-merged@2.
-    """
-    short = {label: _short(name) for label, name in names.items()}
+    """Names for people by label id; names whose short forms are the same keep their full ones."""
+    short = {label: title_of(name) for label, name in names.items()}
     times = Counter(short.values())
     return {label: short[label] if times[short[label]] == 1 else name for label, name in names.items()}
-
-
-def _short(name: str) -> str:
-    category, block = split_name(name)
-    return title_of(category) if block is None else f"{title_of(category)}@{block}"

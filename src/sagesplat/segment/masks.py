@@ -12,7 +12,7 @@ from jaxtyping import Int16, Integer
 from PIL import Image
 
 from sagesplat.core.errors import LabelError, short
-from sagesplat.core.names import LENGTH, RULE, checked, collision_key
+from sagesplat.core.names import RULE, checked, collision_key
 from sagesplat.io.files import atomic_path, read_json, write_json
 from sagesplat.io.pictures import FREE_PIXELS, PictureError, open_picture
 from sagesplat.io.typed import convert_as, refused
@@ -25,7 +25,6 @@ UNLABELLED_COLOR = (128, 128, 128)
 MAX_LABEL_ID = np.iinfo(np.int16).max
 _UNKNOWN = -2  # never leaves this file
 CACHE_BYTES = 2**28  # of the images of a folder that are kept in memory
-_BLOCK = len("@4095")  # what a per-block category adds to the name of its category
 VOID_8, VOID_16 = 255, 65535  # what unlabelled pixels hold in 8- and 16-bit files, unless stated otherwise
 
 
@@ -69,7 +68,7 @@ class Taxonomy:
     @classmethod
     def read(cls, path: Path) -> "Taxonomy":
         """Read labels.json; LabelError where it is missing or its content cannot be used."""
-        return read_labels(path, LENGTH + _BLOCK)[0]
+        return read_labels(path)[0]
 
 
 class Masks:
@@ -173,10 +172,10 @@ def write_labels(folder: Path, taxonomy: Taxonomy, occurring: set[int]) -> None:
     Taxonomy(names).write(folder / "labels.json")
 
 
-def taxonomy_of(names: dict[int, Any], path: Path, length: int = LENGTH) -> Taxonomy:
+def taxonomy_of(names: dict[int, Any], path: Path) -> Taxonomy:
     """A taxonomy whose ids fit and whose names may be; they are distinct, as results are listed by name.
 
-    `path`: the file that the names are from; `length`: characters of a name, at most. LabelError for others.
+    `path`: the file that the names are from. LabelError for others.
     """
     wrong = [label_id for label_id in names if not 0 <= label_id <= MAX_LABEL_ID]
     if wrong:
@@ -189,7 +188,7 @@ def taxonomy_of(names: dict[int, Any], path: Path, length: int = LENGTH) -> Taxo
     for label_id, name in names.items():
         named = f"{path}: label {label_id} is named {short(repr(name))}"
         try:
-            name = checked(name, length)
+            name = checked(name)
         except ValueError as error:
             raise LabelError(f"{named}, but {error}; rename it ({RULE})") from None
         if name in found or name == UNLABELLED_NAME:
@@ -238,11 +237,8 @@ class _Labels:
     unlabelled: int | None = None
 
 
-def read_labels(path: Path, length: int = LENGTH) -> tuple[Taxonomy, int | None]:
-    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated.
-
-    `length`: characters of a name, at most.
-    """
+def read_labels(path: Path) -> tuple[Taxonomy, int | None]:
+    """The taxonomy of a labels.json, and the value of unlabelled pixels if it is stated."""
     content = read_json(path, "it names the ids of the label images", LabelError)
     form = 'of the form {"unlabelled": 255, "labels": {"184": "tree-merged"}}'
     with refused(path, form, "rewrite it so", LabelError):
@@ -252,7 +248,7 @@ def read_labels(path: Path, length: int = LENGTH) -> tuple[Taxonomy, int | None]
         raise LabelError(f'{path}: "unlabelled" is {short(unlabelled)}; give a pixel value, 0 ... {VOID_16}')
     if unlabelled in names:
         raise LabelError(f'{path}: {unlabelled} is "unlabelled" and has a name too; remove one of them')
-    return taxonomy_of(names, path, length), unlabelled
+    return taxonomy_of(names, path), unlabelled
 
 
 def translated(

@@ -12,7 +12,6 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.names import checked
 from sagesplat.io.files import write_json
 from sagesplat.io.typed import read_json_as, refused
-from sagesplat.segment.block_categories import category_of
 
 _CURE = "delete it, and run `sagesplat instances` again with --force"
 
@@ -47,13 +46,8 @@ def read_parents(path: Path) -> dict[str, str]:
 
 
 def with_instances(names: Mapping[int, str], parents: Mapping[str, str], wanted: str) -> list[int]:
-    """Ids of a category or an instance, of the instances of the category, and of all their blocks.
+    """Ids of a category or an instance, and of the instances of the category; empty for no such name.
 
-    `parents` by the names of instances, with their block or without. Empty for no such name.
+    `parents` by the names of instances.
     """
-    found = []
-    for i, name in names.items():
-        of = name, parents.get(name, parents.get(category_of(name), name))
-        if wanted in (*of, *map(category_of, of)):
-            found.append(i)
-    return found
+    return [i for i, name in names.items() if wanted in (name, parents.get(name))]

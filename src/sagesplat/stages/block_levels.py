@@ -5,37 +5,26 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from jaxtyping import Bool, Float
 
-from sagesplat.adapt.ladder import read_prefixes
+from sagesplat.adapt.cells import read_cells
+from sagesplat.adapt.ladder import read_ladder, read_prefixes
 from sagesplat.core.config import NestConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, named
-from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.levels import read_sizes, write_set
 from sagesplat.io.typed import check_limits
 from sagesplat.run.executor import Task, results
 from sagesplat.run.job import Job, JobSpec
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import Blocks, graph_colouring, read_blocks, read_division
-from sagesplat.segment.block_categories import BlockCategories
-from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.blocks import share_masks
 from sagesplat.stages.boundaries import measure_borders
 from sagesplat.stages.nest import nest_levels, write_ladder
 from sagesplat.stages.scene import check_not_adopted
 from sagesplat.stages.shared import label_image_inputs, train_config
 from sagesplat.train import nested
-from sagesplat.train.boundaries import (
-    around,
-    boundary_views,
-    interior,
-    interior_opacities,
-    interior_sizes,
-    read_nested,
-    together,
-)
+from sagesplat.train.boundaries import BlockLevels, around, boundary_views, merged, read_block, write_block
+from sagesplat.train.cells import cells_wanted
 from sagesplat.train.nested import Nested, NestStep
 
 _BOUNDARY = 8  # steps of the levels for each step of boundary tuning
@@ -54,12 +43,12 @@ def nest_scene(job: Job, nest: NestConfig, seed: int) -> None:
 
     def make() -> list[str]:
         every = range(len(blocks))
-        for number in every:
-            spec = job.block_spec(number)
+        specs = [job.block_spec(number) for number in every]
+        for spec in specs:
             share_masks(job, spec.open(job.emit))
-        tasks = [
-            Task(f"block {i}", nest_block, (job.block_spec(i), file, i, nest, seed), job.gpus) for i in every
-        ]
+        configs = [replace(nest, cells=cells) for cells in _cells_of_blocks(job, nest)]
+        parts = zip(every, specs, configs, strict=True)
+        tasks = [Task(f"block {i}", nest_block, (spec, file, i, of, seed), job.gpus) for i, spec, of in parts]
         results(job.executor, tasks, job.emit)
         files = [run.block(number).interior for number in every]
         if steps:
@@ -67,14 +56,22 @@ def nest_scene(job: Job, nest: NestConfig, seed: int) -> None:
         else:  # the table of blocks would show the seconds of an earlier tuning
             for number in every:
                 run.block(number).provenance("boundaries").unlink(missing_ok=True)
-        merged = together(files)
-        one_each = {part: part for part in merged.sizes}
-        lines = write_ladder(job, merged.gaussians, merged.sizes, one_each, nest, merged.second)
+        whole = merged([read_block(path) for path in files])
+        lines = write_ladder(job, whole.gaussians, dict(whole.sizes), whole.label_of, nest, whole.second)
         return [*lines, f"{len(blocks)} blocks, {steps} steps of boundary tuning each"]
 
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run), file]
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.cells, run.increments], make, swaps=True)
     measure_borders(job)
+
+
+def _cells_of_blocks(job: Job, nest: NestConfig) -> list[int]:
+    """The cells that each block is split into: of all that are wanted its share, by its Gaussians."""
+    blocks = [job.run.block(number) for number in range(len(read_blocks(job.run.division)))]
+    counts = [sum(read_ladder(block.levels).files[-1].counts.values()) for block in blocks]
+    in_all = sum(job.last_level.counts.values())  # blocks overlap
+    wanted = cells_wanted(in_all) if nest.cells == "auto" else nest.cells
+    return [round(wanted * count / sum(counts)) for count in counts]
 
 
 def nest_block(
@@ -83,22 +80,23 @@ def nest_block(
     """Make the nested levels of one block, and its interior: the Gaussians inside the block's border."""
     job = spec.open(named(emit, f"block {number}"))
     run = job.run
-    labels = (run.instances if job.run.has_instances else run.masks) / "labels.json"
-    nest_levels(job, replace(config, cells=0), seed)  # a part of a category in a block is a cell
+    blocks = read_blocks(partition)
+
+    def inside(means: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+        return blocks.of(means) == number
+
+    nest_levels(job, config, seed, inside)
 
     def make() -> list[str]:
-        blocks = read_blocks(partition)
-        parts = BlockCategories(Taxonomy.read(labels), len(blocks))
-        full = read_prefixes(run.prefixes)
-        g, inside = interior(full.gaussians, blocks, parts, number)
-        if not len(g):
+        ladder, label_of = read_prefixes(run.prefixes), read_cells(run.cells).label_of
+        full = BlockLevels(ladder.gaussians, ladder.sizes, label_of, ladder.second)
+        own = full.select(inside(full.gaussians.means.numpy()))
+        if not own.sizes:
             raise RunError(f"{run.path}: no Gaussians inside the block; choose fewer with --blocks.count")
-        sizes = interior_sizes(full.gaussians.label_ids.numpy(), inside, full.sizes, parts, number)
-        second = full.second and interior_opacities(full.second, inside, sizes, parts, number)
-        write_set(run.interior, g, config.steps, sizes, second=second)
-        return [f"{len(g):,} of {len(full.gaussians):,} Gaussians are inside the block"]
+        write_block(run.interior, own, config.steps)
+        return [f"{len(own.gaussians):,} of {len(full.gaussians):,} Gaussians are inside the block"]
 
-    inputs = [run.prefixes, labels, partition]
+    inputs = [run.prefixes, run.cells, partition]
     run_stage(job, "interior", {}, inputs, [run.interior], make)
 
 
@@ -129,14 +127,11 @@ def tune_boundaries(
     settings = {**asdict(config), "seed": seed}
 
     def make() -> list[str]:
-        blocks, sizes = read_blocks(partition), read_sizes(run.interior)
-        g, second = own = read_nested(run.interior)
+        blocks, own = read_blocks(partition), read_block(run.interior)
         views = boundary_views(job.scene, blocks, number)
-        near = blocks.to_border(g.means.numpy()) < blocks.margin
-        if views and near.any():
-            g, logits = _tuned(job, own, near, others, views, config, seed)
-            second = second if second is None or logits is None else replace(second, logits=logits)
-        write_set(run.tuned_interior, g, config.steps, sizes, second=second)
+        near = blocks.to_border(own.gaussians.means.numpy()) < blocks.margin
+        tuned = _tuned(job, own, near, others, views, config, seed) if views and near.any() else own
+        write_block(run.tuned_interior, tuned, config.steps)
         return [f"{int(near.sum()):,} of {len(near):,} Gaussians, {len(views)} views of several blocks"]
 
     inputs = [run.scene, run.provenance("train"), run.interior, partition, *others]
@@ -145,29 +140,32 @@ def tune_boundaries(
 
 def _tuned(
     job: Job,
-    own: tuple[Gaussians, SecondOpacities | None],
+    own: BlockLevels,
     near: np.ndarray,
     others: list[Path],
     views: list[int],
     config: NestConfig,
     seed: int,
-) -> tuple[Gaussians, Tensor | None]:
-    """The block's Gaussians after the training, and their second opacities."""
+) -> BlockLevels:
+    """The block's levels after the training."""
     scene = job.scene
-    g, second = around(own, others, scene, views)
-    n = len(g)
-    movable = np.concatenate([near, np.zeros(n - len(near), bool)])
+    seen = around(own, others, scene, views)
+    g, of_others = seen.gaussians, len(seen.gaussians) - len(near)
+    movable = np.concatenate([near, np.zeros(of_others, bool)])
     kept = frozenset(view.name for row, view in enumerate(scene.views) if row not in set(views))
     narrowed = replace(scene, test_names=kept)
-    ladder = Nested(g, np.zeros(n, bool), second)
+    ladder = Nested(g, np.zeros(len(g), bool), None if seen.second is None else seen.second.logits)
     for event in nested.nest(
         ladder, narrowed, job.photos, train_config(job), config,
-        valid=job.valid, seed=seed, backend=job.backend, movable=movable,
+        valid=job.valid, seed=seed, backend=job.backend, movable=movable, label_of=seen.label_of,
     ):  # fmt: skip
         if isinstance(event, NestStep):
             job.emit(Progress("boundaries", event.step, config.steps, f"loss {event.loss:.3f}"))
         elif isinstance(event, Nested):
-            mine = torch.isin(event.gaussians.label_ids, torch.unique(own[0].label_ids))
-            second = event.second_opacities
-            return event.gaussians.select(mine), None if second is None else second[mine]
+            mine = torch.isin(event.gaussians.label_ids, torch.unique(g.label_ids[: len(near)]))
+            tuned = replace(event.gaussians.select(mine), label_ids=own.gaussians.label_ids)
+            second, logits = own.second, event.second_opacities
+            if second is not None and logits is not None:
+                second = replace(second, logits=logits[mine])
+            return replace(own, gaussians=tuned, second=second)
     raise AssertionError("training ends with a Nested event")

@@ -1,8 +1,8 @@
 """Makes the levels of a scene: trained as one or, of a large scene, in blocks that are merged.
 
 A block has its own run folder, RUN/blocks/NNN, whose capture is a part of the scene. It is trained and nested
-like any other run, on any node, and resumes after a kill. In the merged scene every (block, category) pair is
-a category of its own (`segment.block_categories`), and later stages treat it as any other category.
+like any other run, on any node, and resumes after a kill. In the merged scene a category has cells in each
+block that it is in (`train.boundaries`), and later stages treat it as any other scene.
 """
 
 import shutil
@@ -13,10 +13,9 @@ import numpy as np
 import torch
 
 from sagesplat.adapt.ladder import read_ladder
-from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.core.config import BlocksConfig, TrainConfig
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import Emit, Progress, named
+from sagesplat.core.events import Emit, named
 from sagesplat.core.gaussians import concat
 from sagesplat.formats.levels import read_level, write_level
 from sagesplat.io.files import link, write_json
@@ -37,13 +36,11 @@ from sagesplat.scene.blocks import (
 )
 from sagesplat.scene.scene import Scene
 from sagesplat.scene.stored import write_scene
-from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.lift import LiftedLabels
-from sagesplat.segment.masks import mask_path, prepare_folder, write_labels, write_mask
+from sagesplat.segment.masks import mask_path
 from sagesplat.stages.scene import check_not_adopted
 from sagesplat.stages.train import read_frozen, train_inputs, train_levels, write_frozen
 from sagesplat.train import memory
-from sagesplat.train.boundaries import interior
 
 _SEEN = 0.01  # share of a photo's visible points from which on it sees a block
 
@@ -157,7 +154,6 @@ def train_scene(job: Job, train: TrainConfig, config: BlocksConfig, seed: int) -
     settings = {**asdict(train), "batch": max(train.batch, job.processes), "seed": seed}
     settings["blocks"] = asdict(config)
     blocks = divide(job, config, seed)
-    parts = BlockCategories(job.masks.taxonomy, len(blocks))
 
     def make() -> list[str]:
         tasks = []
@@ -169,7 +165,7 @@ def train_scene(job: Job, train: TrainConfig, config: BlocksConfig, seed: int) -
             tasks.append(Task(f"block {number}", train_block, what, job.gpus, _needed(block, train)))
         results(job.executor, tasks, job.emit)
         run.provenance("train").unlink(missing_ok=True)  # from here on the earlier levels are gone
-        merged = _merge_levels(run, blocks, parts)
+        merged = _merge_levels(run, blocks)
         return [f"{merged:,} Gaussians of {len(blocks)} blocks"]
 
     inputs = [*train_inputs(job, train), run.division, run.provenance("blocks")]
@@ -181,7 +177,7 @@ def train_block(spec: JobSpec, number: int, config: TrainConfig, seed: int, emit
     train_levels(spec.open(named(emit, f"block {number}")), config, seed)
 
 
-def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
+def _merge_levels(run: RunDir, blocks: Blocks) -> int:
     """Write merged levels from the interiors of all blocks; the number of Gaussians in the last one."""
     ladders = [read_ladder(run.block(number).levels) for number in range(len(blocks))]
     shutil.rmtree(run.levels, ignore_errors=True)
@@ -189,11 +185,8 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
     for step in sorted({level for ladder in ladders for level in ladder.levels}):
         # blocks in which all categories stopped early have fewer levels
         files = [[f for f in ladder.files if f.step <= step][-1:] for ladder in ladders]
-        interiors = [
-            interior(read_level(f.path), blocks, parts, number)[0]
-            for number, newest in enumerate(files)
-            for f in newest
-        ]
+        parts = [(number, read_level(f.path)) for number, newest in enumerate(files) for f in newest]
+        interiors = [g.select(torch.from_numpy(blocks.of(g.means.numpy()) == number)) for number, g in parts]
         flat = [f for newest in files for f in newest]
         g = concat(interiors)
         write_level(
@@ -201,50 +194,11 @@ def _merge_levels(run: RunDir, blocks: Blocks, parts: BlockCategories) -> int:
             sh_degree=max(f.sh_degree for f in flat),
         )  # fmt: skip
         count = len(g)
+    stops = [read_frozen(run.block(number).frozen) for number in range(len(blocks))]
     frozen = {}
-    for number in range(len(blocks)):
-        for label, step in read_frozen(run.block(number).frozen).items():
-            frozen[int(parts.ids(np.array(label), number))] = step
+    for label in sorted(set().union(*stops)):  # a category has stopped where it has in all its blocks
+        own = [of for of, ladder in zip(stops, ladders, strict=True) if label in ladder.files[-1].counts]
+        if own and all(label in of for of in own):
+            frozen[label] = max(of[label] for of in own)
     write_frozen(run.frozen, frozen)
     return count
-
-
-def label_block_categories(job: Job) -> None:
-    """Render label images for a scene split into blocks; every (block, category) pair is its own category.
-
-    A pixel keeps its category and gets the block whose Gaussians contribute most to it.
-    """
-    check_not_adopted(job.run)
-    run = job.run
-    blocks, masks = read_blocks(run.division), job.category_masks
-    parts = BlockCategories(masks.taxonomy, len(blocks))
-
-    def make() -> list[str]:
-        scene, names = job.scene, parts.names
-        g = job.load_last_level()
-        by_block = replace(g, label_ids=torch.from_numpy(parts.block_of(g.label_ids.numpy())))
-        painted = RenderedLabels(by_block, job.backend, job.antialiased)
-        shutil.rmtree(run.block_categories, ignore_errors=True)
-        paths = prepare_folder(run.block_categories, scene.views)
-        occurring = set(g.counts())
-        for row, (view, path) in enumerate(zip(scene.views, paths, strict=True)):
-            shown = painted[view]
-            own = int(blocks.of(view.camera.position[None])[0])
-            part_ids = parts.ids(masks[view], np.where(shown < 0, own, shown))
-            write_mask(path, part_ids, names)
-            occurring |= set(np.unique(part_ids).tolist())
-            job.emit(Progress("block_categories", row + 1, len(scene.views)))
-        lifted = LiftedLabels.read(run.labels, len(scene.points.xyz))
-        ids = parts.ids(lifted.label_ids, blocks.of(scene.points.xyz))
-        replace(lifted, label_ids=ids).write(run.block_categories / "labels.npz")
-        write_labels(run.block_categories, names, occurring | set(np.unique(ids).tolist()))
-        return [
-            f"{len(occurring)} per-block categories of {len(masks.taxonomy.names)} in {len(blocks)} blocks"
-        ]
-
-    made = [run.provenance(stage) for stage in ("train", "masks")]
-    inputs = [run.scene, run.labels, run.levels, run.division, run.masks / "labels.json", *made]
-    if masks.folder == run.fused:
-        inputs.append(run.provenance("fuse"))
-    outputs = [run.block_categories / "labels.json", run.block_categories / "labels.npz"]
-    run_stage(job, "block_categories", {}, inputs, outputs, make)

@@ -18,7 +18,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.recorded import stage_seconds
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.blocks import Blocks, read_blocks, read_division
-from sagesplat.train.boundaries import bands, together
+from sagesplat.train.boundaries import bands, merged, read_block
 from sagesplat.train.early_stopping import spread
 
 _TIMED = ("train", "base", "nest", "boundaries")  # stages of a block whose seconds are shown
@@ -32,8 +32,8 @@ def measure_borders(job: Job) -> None:
 
     def make() -> list[str]:
         blocks = read_blocks(file)
-        files = [run.block(number).interior for number in range(len(blocks))]
-        sets = {"merged": together(files).full, "tuned": job.ladder.load(job.ladder.levels[-1])}
+        parts = [read_block(run.block(number).interior) for number in range(len(blocks))]
+        sets = {"merged": merged(parts).full, "tuned": job.ladder.load(job.ladder.levels[-1])}
         tables = [balance_table(job, blocks), border_table(job, blocks, sets)]
         for table in tables:
             job.emit(table.event)

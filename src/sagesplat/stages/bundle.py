@@ -35,7 +35,6 @@ from sagesplat.stages.results import (
     promises_of,
     viewpoints_of,
 )
-from sagesplat.stages.shared import category_and_block
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.bundle import BundleSizes, check_target, write_bundle
 from sagesplat.viewer.corrections import with_corrections
@@ -76,9 +75,8 @@ def bundle(
 
     `meters_per_unit`: scale of the scene; by default guessed from the cameras' height. `always`: categories
     shipped in full. `weights`: by category, 1 for the others. An edited run has settings of its own
-    (`stages.edited`), to which these are added. In a scene in blocks, a category's name stands
-    for all its per-block categories, and `name@block` for one of them. `chunks`: format of the increments; by
-    default that of the run. `viewer`: the built viewer; by default the package's own.
+    (`stages.edited`), to which these are added. `chunks`: format of the increments; by default that of the
+    run. `viewer`: the built viewer; by default the package's own.
 
     RunError for a run without nested levels or bounds, or without streams, another folder, unknown names or
     an impossible number; DataError for a damaged increment; SageError without a viewer.
@@ -88,7 +86,6 @@ def bundle(
     _check_made(job)
     job = _without_capture(job)
     names = set(job.names().values())
-    names |= {category_and_block(job, name)[0] for name in names}
     always = [*edited.always, *(meant(composed(name), names) for name in always)]
     given = {meant(composed(name), names): weight for name, weight in (weights or {}).items()}
     weights = edited.weights | given
@@ -190,12 +187,8 @@ def _check_asked(
     if meters_per_unit is not None and not 1e-6 <= meters_per_unit <= 1e6:
         raise RunError(f"{meters_per_unit} metres per unit are impossible; give a number such as 0.5")
     names = set(job.names().values())
-    categories = {category_and_block(job, name)[0] for name in names}
-    if unknown := sorted({*always, *weights} - names - categories):
-        one = ", each also NAME@BLOCK" if job.has_block_categories else ""
-        raise RunError(
-            f"{', '.join(unknown)}: no such category; there are {', '.join(sorted(categories))}{one}"
-        )
+    if unknown := sorted({*always, *weights} - names):
+        raise RunError(f"{', '.join(unknown)}: no such category; there are {', '.join(sorted(names))}")
     for name, weight in weights.items():
         if not 0 <= weight <= 1e6:
             raise RunError(f"weight {weight} of {name} is impossible; give a number from 0 on, such as 2")
@@ -208,12 +201,12 @@ def _with_quality(
     seen = _seen_in_photos(job) if has_photos(job.run) else {}
     found = []
     for category in categories:
-        label, whole = category.label_id, category_and_block(job, category.name)[0]
+        label = category.label_id
         found.append(
             replace(
                 category,
-                weight=float(weights.get(category.name, weights.get(whole, 1.0))),
-                always=category.name in always or whole in always,
+                weight=float(weights.get(category.name, 1.0)),
+                always=category.name in always,
                 fidelity=fidelity.get(label),
                 ssim=ssim.get(label),
                 seen=seen.get(label),

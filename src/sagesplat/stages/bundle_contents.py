@@ -7,7 +7,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.run.job import Job
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.shared import category_and_block, category_colors
+from sagesplat.stages.shared import category_colors
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents
 
 _GROUND = {"dirt", "floor", "grass", "gravel", "ground", "pavement", "platform", "playingfield", "railroad"}
@@ -19,9 +19,8 @@ def bundle_contents(job: Job, g: Gaussians, cells: Cells, antialiased: bool) -> 
     scene, names = job.scene, job.names()
     labels = sorted(set(cells.labels.tolist()))
     job.check_named(job.run.levels, labels)
-    split_names = {i: category_and_block(job, names[i]) for i in labels}
-    colors = category_colors(job, {category for category, _ in split_names.values()})
-    ground = [i for i in labels if _GROUND & set(_title(job, split_names[i][0]).split())]
+    colors = category_colors(job, {names[i] for i in labels})
+    ground = [i for i in labels if _GROUND & set(_title(job, names[i]).split())]
     parents = job.parents
     return Contents(
         name=scene.name,
@@ -30,14 +29,8 @@ def bundle_contents(job: Job, g: Gaussians, cells: Cells, antialiased: bool) -> 
             CameraEntry(view.name, scene.split(row), view.camera) for row, view in enumerate(scene.views)
         ],
         categories=[
-            Category(
-                i,
-                names[i],
-                _title(job, category) + ("" if block is None else f" (block {block})"),
-                colors[category],
-                parent=parents.get(category),
-            )
-            for i, (category, block) in split_names.items()
+            Category(i, names[i], _title(job, names[i]), colors[names[i]], parent=parents.get(names[i]))
+            for i in labels
         ],
         cells=cells,
         chunks=[],
@@ -50,4 +43,4 @@ def bundle_contents(job: Job, g: Gaussians, cells: Cells, antialiased: bool) -> 
 
 
 def _title(job: Job, category: str) -> str:
-    return title_of(category) if category != job.whole_masks.taxonomy.name(UNLABELLED) else "everything else"
+    return title_of(category) if category != job.level_masks.taxonomy.name(UNLABELLED) else "everything else"

@@ -20,9 +20,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
-from sagesplat.scene.blocks import read_blocks
 from sagesplat.scene.scene import View
-from sagesplat.segment.block_categories import BlockCategories
 from sagesplat.segment.display_names import title_of
 from sagesplat.segment.edit import apply, edit_table, parse_names
 from sagesplat.segment.instances import (
@@ -100,19 +98,12 @@ def make_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> None:
     merge = later_merges(run, labels)
     outputs = [run.instances / "labels.json", run.instance_labels]
     stages = ["masks", "train", "fuse"]
-    if job.has_blocks:
-        if not (run.block_categories / "labels.json").exists():
-            raise RunError(f"{run.block_categories}: not there yet; run `sagesplat block-categories`")
-        outputs.append(run.block_instances / "labels.json")
-        stages.append("block_categories")
 
     def make() -> list[str]:
         _remove(run)
         masks = job.category_masks
         ids = wanted_ids(masks.taxonomy.names, wanted)
         g = job.load_last_level()
-        if job.has_blocks:
-            g = replace(g, label_ids=torch.from_numpy(_parts(job, masks).category_ids(g.label_ids.numpy())))
         found = _find(job, g, masks, ids)
         taxonomy, table = edit_table(found.taxonomy, merge=merge)
         parents = {int(table[i]): p for i, p in found.parents.items() if table[i] not in masks.taxonomy.names}
@@ -122,8 +113,6 @@ def make_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> None:
         within = _within(lifted.label_ids, before.label_ids, parents)
         lifted = replace(lifted, label_ids=within, ignored=before.ignored)
         lifted.write(run.instance_labels)
-        if job.has_blocks:
-            _split_by_block(job, masks, Masks(run.instances, taxonomy), lifted)
         write_parents(run.parents, {taxonomy.names[i]: taxonomy.names[p] for i, p in parents.items()})
         taxonomy.write(run.instances / "labels.json")
         return [_line(apply(found.label_ids, table), taxonomy, parents)]
@@ -137,8 +126,7 @@ def make_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> None:
 def _remove(run: RunDir) -> None:
     run.provenance("instances").unlink(missing_ok=True)
     run.parents.unlink(missing_ok=True)
-    for folder in (run.instances, run.block_instances):
-        shutil.rmtree(folder, ignore_errors=True)
+    shutil.rmtree(run.instances, ignore_errors=True)
 
 
 def _find(job: Job, g: Gaussians, masks: Masks, ids: list[int]) -> Instances:
@@ -200,27 +188,6 @@ def _draw(
             after = np.where(hidden & (of[behind + 1] == shown), behind, after)
         write_mask(path, apply(after, table), taxonomy)
         job.emit(Progress("instances", done + row + 1, done + len(views)))
-
-
-def _parts(job: Job, masks: Masks) -> BlockCategories:
-    """The (block, category) pairs of the categories of `masks`."""
-    return BlockCategories(masks.taxonomy, len(read_blocks(job.run.division)))
-
-
-def _split_by_block(job: Job, before: Masks, instances: Masks, points: LiftedLabels) -> None:
-    """Write label images and point labels of (block, instance) pairs.
-
-    A pixel is of the block that its (block, category) pair is of: instances move no border of blocks.
-    """
-    run, parts, of_categories = job.run, _parts(job, instances), _parts(job, before)
-    by_block = Masks(run.block_categories, of_categories.names)
-    views = job.scene.views
-    for view, path in zip(views, prepare_folder(run.block_instances, views), strict=True):
-        write_mask(path, parts.ids(instances[view], of_categories.block_of(by_block[view])), parts.names)
-    block = read_blocks(run.division).of(job.scene.points.xyz)
-    labels = replace(points, label_ids=parts.ids(points.label_ids, block))
-    labels.write(run.block_instances / "labels.npz")
-    parts.names.write(run.block_instances / "labels.json")
 
 
 def _within(label_ids: np.ndarray, before: np.ndarray, parents: Mapping[int, int]) -> np.ndarray:

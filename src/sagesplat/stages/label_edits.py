@@ -60,8 +60,8 @@ def apply_labels(
 ) -> LabelsApplied:
     """Make a new run of a finished one, with edited categories, and its bundle: `sagesplat.apply_labels`.
 
-    The run stays as it is. RunError also for a run in blocks or with levels that replace those below, where
-    the edits do more than hide, weigh and keep in full. `viewer`: the built one; None: the package's own.
+    The run stays as it is. RunError also for a run with levels that replace those below, where the edits
+    merge or split. `viewer`: the built one; None: the package's own.
     """
     path = edits or job.run.path / FILE
     out = (out or job.run.path.resolve().with_name(f"{job.run.path.resolve().name}-edited")).resolve()
@@ -109,11 +109,6 @@ def _checked(job: Job, edits: LabelEdits, path: Path) -> Relabelled:
             f"{path}: the name {taken[0]!r} is that of a category that label images show, without Gaussians; "
             "choose another"
         )
-    if job.has_block_categories and (made.changed or made.names != {i: names[i] for i in counts}):
-        raise RunError(
-            f"{job.run.path}: a scene in blocks; its categories can be hidden, weighed and kept in full, but "
-            "not renamed, merged or split"
-        )
     if made.changed and (ladder.replaces or any(one.format != "stream" for one in increments)):
         raise RunError(
             f"{job.run.path}: levels that replace those below, or SPZ files; its categories can be renamed, "
@@ -144,11 +139,7 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
             earlier.unlink()
     if job.run.has_instances:
         _keep_instances_alone(job.run, new)
-    if job.has_block_categories:  # they keep their names
-        shutil.copytree(job.run.block_labels, new.block_categories)
-        write_parents(new.parents, job.parents)
-    else:
-        write_parents(new.parents, made.parents(job.parents, job.names()))
+    write_parents(new.parents, made.parents(job.parents, job.names()))
     settings = LabelSettings(made.weights, made.hidden, made.always)
     write_edited(new, job.run.path.name, loads_json(dump_edits(edits)), settings)
     return Job(

@@ -1,9 +1,10 @@
 """Makes the nested levels and their increments, from the trained Gaussians: orders them, trains prefixes."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from sagesplat.adapt.cells import describe_cells, write_cells
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
@@ -30,8 +31,16 @@ from sagesplat.train.nested import NestStep
 _ROUNDED = 0.01  # SSIM that rounding may cost without a word
 
 
-def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
-    """Order the trained Gaussians and train their prefixes; write the ladder and its chunks."""
+def nest_levels(
+    job: Job,
+    config: NestConfig,
+    seed: int,
+    inside: Callable[[Float[np.ndarray, "N 3"]], Bool[np.ndarray, " N"]] | None = None,
+) -> None:
+    """Order the trained Gaussians and train their prefixes; write the ladder and its chunks.
+
+    `inside` says by their positions which Gaussians of a block's decide its cells; None: all.
+    """
     run = job.run
     check_limits(config, "nest.")
     settings = {**asdict(config), "seed": seed}
@@ -48,7 +57,8 @@ def nest_levels(job: Job, config: NestConfig, seed: int) -> None:
             base=base, valid=job.inliers, antialiased=job.antialiased, shell=shell,
         )  # fmt: skip
         wanted = cells_wanted(len(ordered.gaussians)) if config.cells == "auto" else config.cells
-        ordered, label_of = nested.in_cells(ordered, wanted)
+        within = None if inside is None else inside(ordered.gaussians.means.numpy())
+        ordered, label_of = nested.in_cells(ordered, wanted, within)
         key = checkpoint_key(run, settings, inputs)
         if job.force and not can_resume(run.nest_checkpoint, key):
             remove_checkpoints(run.nest_checkpoint)

@@ -78,8 +78,6 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
         fuse_masks(job)
     elif job.run.fused.exists():
         raise RunError(f"{job.run.fused}: label images were fused; add --fuse, or delete that folder")
-    if job.has_blocks:
-        blocks.label_block_categories(job)
     make_instances(job, config.masks, config.labels)
     if job.run.ladder == "nested":
         if not job.has_blocks:

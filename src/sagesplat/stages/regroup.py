@@ -120,8 +120,6 @@ def _write_cells(job: Job, new: Job, cells: Mapping[int, NewCell]) -> None:
 
 def move_labels(job: Job, new: Job, made: Relabelled) -> None:
     """Write label images, their labels.json and the labels of points of the new categories."""
-    if job.has_block_categories:
-        return
     names = {label: name for label, name in made.names.items() if label != UNLABELLED}
     before = job.taxonomy.names
     # categories without Gaussians that are to be seen stay in the label images

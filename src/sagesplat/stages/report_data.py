@@ -33,7 +33,6 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage_table import STAGES, needed_for
 from sagesplat.scene import describe
 from sagesplat.scene.scene import Camera
-from sagesplat.segment.block_categories import category_of
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.methods import method_of
@@ -95,7 +94,6 @@ def report_data(
         settings=_settings(records),
         timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
         provenance=_provenance(records),
-        categories=_parts(run, names),
         exposed=any(scene.views[row].camera.exposure is not None for row in scene.test_ids),
         photos=has_photos(run),
         adopted=_adopted(job, ladder) if run.adopted.exists() and isinstance(ladder, NestedLadder) else (),
@@ -149,17 +147,6 @@ def stage_records(run: RunDir) -> list[Path]:
     elif not uses(run, "nest", run.base_model):
         made.remove("base")
     return [path for stage in STAGES if stage in made and (path := run.provenance(stage)).exists()]
-
-
-def _parts(run: RunDir, names: dict[int, str]) -> dict[int, int]:
-    """Of a scene in blocks: the label of each per-block category's category; else nothing."""
-    if not (run.block_labels / "labels.json").exists():
-        return {}
-    of = {label: category_of(name) for label, name in sorted(names.items())}
-    stands: dict[str, int] = {}
-    for label, category in of.items():
-        stands.setdefault(category, label)
-    return {label: stands[category] for label, category in of.items() if label != UNLABELLED}
 
 
 def _commands(job: Job) -> Commands:

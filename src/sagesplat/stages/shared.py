@@ -22,7 +22,6 @@ from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.scene import Camera, View
-from sagesplat.segment.block_categories import split_name
 from sagesplat.segment.display_colors import colors_of, rgb_of
 from sagesplat.segment.display_names import meant
 from sagesplat.segment.masks import UNLABELLED
@@ -38,7 +37,7 @@ def train_config(job: Job) -> TrainConfig:
 
 def label_image_inputs(run: RunDir) -> list[Path]:
     """What decides the label images that stages after training look at: the records of who made them."""
-    made = [("masks", run.masks), ("fuse", run.fused), ("block_categories", run.block_categories)]
+    made = [("masks", run.masks), ("fuse", run.fused)]
     made += [("instances", run.instances)] if run.has_instances else []
     return [run.provenance(stage) for stage, folder in made if (folder / "labels.json").exists()]
 
@@ -73,14 +72,13 @@ def observed(job: Job) -> Observations:
 
 
 def labels_named(job: Job, names: Sequence[str]) -> list[int]:
-    """The ids of categories and instances, those of a category with all its instances and blocks.
+    """The ids of categories and instances, those of a category with all its instances.
 
     Names are those of the run, or as people are shown them (grass for grass-merged). RunError for a name that
     the run does not have.
     """
     known, found, parents = job.names(), list[int](), job.parents
-    without_blocks = {category_and_block(job, name)[0] for name in known.values()}
-    all_names = {*known.values(), *without_blocks, *parents.values()}
+    all_names = {*known.values(), *parents.values()}
     for name in names:
         wanted = meant(composed(name), all_names)
         ids = with_instances(known, parents, wanted)
@@ -99,26 +97,19 @@ def label_named(job: Job, name: str) -> int:
     return ids[stored]
 
 
-def category_and_block(job: Job, name: str) -> tuple[str, int | None]:
-    """The category and block of a label's name; block None unless the scene is in blocks."""
-    return split_name(name) if job.has_block_categories else (name, None)
-
-
 def category_colors(job: Job, categories: Collection[str]) -> dict[str, str]:
     """A colour such as "#e5484d" for each category by name: that of the viewer, the report and its figures.
 
     All categories that have Gaussians are to be given: colours are chosen together.
     """
-    taxonomy = job.whole_masks.taxonomy
+    taxonomy = job.level_masks.taxonomy
     ids = [i for i in (UNLABELLED, *taxonomy.names) if taxonomy.name(i) in categories]
     colors = colors_of({i: taxonomy.color(i) for i in ids})
     return {taxonomy.name(i): colors[i] for i in ids}
 
 
 def label_colors(job: Job) -> dict[int, tuple[int, int, int]]:
-    """RGB, 0 to 255, of each label id: `category_colors`, of parts of blocks that of their category."""
+    """RGB, 0 to 255, of each label id: `category_colors`."""
     names = job.names()
-    drawn = {names[label] for (label, _), count in job.ladder.counts.items() if count}
-    colors = category_colors(job, {category_and_block(job, name)[0] for name in drawn})
-    of = {label: category_and_block(job, name)[0] for label, name in names.items()}
-    return {label: rgb_of(colors[category]) for label, category in of.items() if category in colors}
+    colors = category_colors(job, {names[label] for (label, _), count in job.ladder.counts.items() if count})
+    return {label: rgb_of(colors[name]) for label, name in names.items() if name in colors}

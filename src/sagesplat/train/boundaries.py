@@ -7,69 +7,29 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool
-from torch import Tensor
 
 from sagesplat.core import geometry
-from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.gaussians import Gaussians, concat, relabelled
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.levels import read_level, read_second, read_sizes
+from sagesplat.formats.levels import read_level, read_more, read_second, read_sizes, write_set
 from sagesplat.metrics.image import psnr
 from sagesplat.scene.blocks import Blocks, visible_shares
 from sagesplat.scene.scene import Scene
-from sagesplat.segment.block_categories import BlockCategories
+from sagesplat.segment.masks import MAX_LABEL_ID, UNLABELLED
 
 SEVERAL = 0.1  # share of what a view sees that is of other blocks, from which on it is a boundary view
 _PAD = 0.25  # of the image beyond its edges: Gaussians with their centre there may reach into it
 
 
-def interior(
-    g: Gaussians, blocks: Blocks, parts: BlockCategories, block: int
-) -> tuple[Gaussians, Bool[np.ndarray, " N"]]:
-    """Gaussians in the interior of a block, with per-block categories; and which rows (bool) they are."""
-    inside = blocks.of(g.means.numpy()) == block
-    kept = g.select(torch.from_numpy(inside))
-    part_ids = parts.ids(kept.label_ids.numpy(), block)
-    return replace(kept, label_ids=torch.from_numpy(part_ids)), inside
-
-
-def interior_sizes(
-    labels: np.ndarray,
-    inside: np.ndarray,
-    sizes: Mapping[int, tuple[int, ...]],
-    parts: BlockCategories,
-    block: int,
-) -> dict[int, tuple[int, ...]]:
-    """Level sizes, by per-block category, of the interior (bool [N]) of an ordered model: at least one."""
-    found = {}
-    for label, levels in sizes.items():
-        summed = np.concatenate([[0], inside[labels == label].cumsum()])
-        if summed[-1]:
-            found[int(parts.ids(np.array(label), block))] = tuple(int(max(1, summed[n])) for n in levels)
-    return found
-
-
-def interior_opacities(
-    second: SecondOpacities,
-    inside: np.ndarray,
-    sizes: Mapping[int, tuple[int, ...]],
-    parts: BlockCategories,
-    block: int,
-) -> SecondOpacities:
-    """Second opacities of the interior (bool [N]) of a model, with the weights that it was trained with.
-
-    `sizes`: of `interior_sizes`.
-    """
-    of_parts = {int(parts.ids(np.array(label), block)): w for label, w in second.weights.items()}
-    return SecondOpacities(second.logits[torch.from_numpy(inside)], {i: of_parts[i] for i in sizes})
-
-
 @dataclass(frozen=True, eq=False)
-class Merged:
-    """The nested models of all blocks."""
+class BlockLevels:
+    """The nested levels of a block, or of several that were merged, by cell."""
 
-    gaussians: Gaussians
-    sizes: dict[int, tuple[int, ...]]  # of levels, by label id
-    second: SecondOpacities | None
+    gaussians: Gaussians  # the label ids are those of cells
+    sizes: Mapping[int, tuple[int, ...]]  # of levels, by cell
+    label_of: Mapping[int, int]  # label id by cell
+    second: SecondOpacities | None = None
 
     @property
     def full(self) -> Gaussians:
@@ -77,26 +37,64 @@ class Merged:
         g, second = self.gaussians, self.second
         return g if second is None else replace(g, logit_opacities=second.logits)
 
-
-def together(files: Sequence[Path]) -> Merged:
-    """The nested models of all blocks, merged; their categories differ."""
-    sizes = {label: n for path in files for label, n in read_sizes(path).items()}
-    models = [read_nested(path) for path in files]
-    seconds = [second for _, second in models]
-    logits, weights = _second(seconds), {i: w for one in seconds if one for i, w in one.weights.items()}
-    second = None if logits is None else SecondOpacities(logits, weights)
-    return Merged(concat([g for g, _ in models]), sizes, second)
-
-
-def read_nested(path: Path) -> tuple[Gaussians, SecondOpacities | None]:
-    """All Gaussians of a nested ladder, and their second opacities."""
-    return read_level(path), read_second(path, read_sizes(path))
+    def select(self, rows: Bool[np.ndarray, " N"]) -> "BlockLevels":
+        """Some of the Gaussians, in levels of those that are left: at least one where a cell has some."""
+        cells, sizes = self.gaussians.label_ids.numpy(), {}
+        for cell, levels in self.sizes.items():
+            summed = np.concatenate([[0], rows[cells == cell].cumsum()])
+            if summed[-1]:
+                sizes[cell] = tuple(int(max(1, summed[n])) for n in levels)
+        kept, second = torch.from_numpy(rows), self.second
+        if second is not None:
+            second = SecondOpacities(second.logits[kept], {cell: second.weights[cell] for cell in sizes})
+        label_of = {cell: self.label_of[cell] for cell in sizes}
+        return BlockLevels(self.gaussians.select(kept), sizes, label_of, second)
 
 
-def _second(parts: Sequence[SecondOpacities | None]) -> Tensor | None:
-    """Their logits in one row; None where a part has none."""
-    logits = [part.logits for part in parts if part is not None]
-    return torch.cat(logits) if len(logits) == len(parts) else None
+def write_block(path: Path, block: BlockLevels, step: int) -> None:
+    """Write what `read_block` reads."""
+    labels = [block.label_of[cell] for cell in sorted(block.sizes)]
+    write_set(path, block.gaussians, step, block.sizes, second=block.second, labels=labels)
+
+
+def read_block(path: Path) -> BlockLevels:
+    """What `write_block` wrote; DataError for anything else."""
+    sizes = read_sizes(path)
+    labels = read_more(path, "labels")
+    possible = labels.dtype.kind == "i" and ((labels >= UNLABELLED) & (labels <= MAX_LABEL_ID)).all()
+    if labels.shape != (len(sizes),) or not possible:
+        raise DataError(
+            f"{path}: not the labels of {len(sizes)} cells; delete it and run `sagesplat nest` again"
+        )
+    label_of = dict(zip(sorted(sizes), labels.tolist(), strict=True))
+    return BlockLevels(read_level(path), sizes, label_of, read_second(path, sizes))
+
+
+def merged(blocks: Sequence[BlockLevels]) -> BlockLevels:
+    """The levels of all blocks, in their order; cells are numbered anew, by category and then by block.
+
+    Of one block they keep their order, as cells are numbered by category everywhere.
+    """
+    cells = sorted(
+        (label, block, cell) for block, one in enumerate(blocks) for cell, label in one.label_of.items()
+    )
+    if len(cells) > MAX_LABEL_ID:
+        raise RunError(
+            f"{len(cells):,} cells in {len(blocks)} blocks; choose fewer with --blocks.count or --nest.cells"
+        )
+    new = {(block, cell): i for i, (_, block, cell) in enumerate(cells)}
+    tables = [{cell: new[block, cell] for cell in one.label_of} for block, one in enumerate(blocks)]
+    both = list(zip(tables, blocks, strict=True))
+    seconds, second = [one.second for one in blocks if one.second], None
+    if len(seconds) == len(blocks):
+        weights = {to[cell]: w for to, one in both if one.second for cell, w in one.second.weights.items()}
+        second = SecondOpacities(torch.cat([one.logits for one in seconds]), weights)
+    return BlockLevels(
+        concat([relabelled(one.gaussians, to) for to, one in both]),
+        {to[cell]: sizes for to, one in both for cell, sizes in one.sizes.items()},
+        {i: label for i, (label, _, _) in enumerate(cells)},
+        second,
+    )
 
 
 def boundary_views(scene: Scene, blocks: Blocks, block: int) -> list[int]:
@@ -116,23 +114,13 @@ def in_sight(g: Gaussians, scene: Scene, views: Sequence[int]) -> Bool[np.ndarra
     return seen
 
 
-def around(
-    own: tuple[Gaussians, SecondOpacities | None],
-    others: Iterable[Path],
-    scene: Scene,
-    views: Sequence[int],
-) -> tuple[Gaussians, Tensor | None]:
-    """A block's Gaussians, then those of other blocks that its views see, and the second opacities of all.
-
-    The files of `others` are read one by one.
-    """
-    parts, seconds = [own[0]], [own[1]]
+def around(own: BlockLevels, others: Iterable[Path], scene: Scene, views: Sequence[int]) -> BlockLevels:
+    """A block's levels, then what its views see of those of other blocks, whose files are read one by one."""
+    parts = [own]
     for path in others:
-        g, second = read_nested(path)
-        seen = torch.from_numpy(in_sight(g, scene, views))
-        parts.append(g.select(seen))
-        seconds.append(second and second.select(seen))
-    return concat(parts), _second(seconds)
+        other = read_block(path)
+        parts.append(other.select(in_sight(other.gaussians, scene, views)))
+    return merged(parts)
 
 
 @dataclass(frozen=True)

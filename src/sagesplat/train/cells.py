@@ -7,7 +7,7 @@ contracted into a ball of twice its radius (Mip-NeRF 360, Eq. 10).
 import warnings
 
 import numpy as np
-from jaxtyping import Float, Int, Int16
+from jaxtyping import Bool, Float, Int, Int16
 from scipy.cluster.vq import kmeans2
 
 MOST = 64  # cells of a scene that is split automatically
@@ -23,20 +23,28 @@ def cells_wanted(count: int) -> int:
 
 
 def split_cells(
-    means: Float[np.ndarray, "N 3"], label_ids: Int16[np.ndarray, " N"], count: int
+    means: Float[np.ndarray, "N 3"],
+    label_ids: Int16[np.ndarray, " N"],
+    count: int,
+    inside: Bool[np.ndarray, " N"] | None = None,
 ) -> tuple[Int16[np.ndarray, " N"], dict[int, int]]:
     """Split each category into compact cells, about `count` in all; 0: every category is one cell.
+
+    Only Gaussians `inside` count, and decide where cells are; others join the nearest. None: all are inside.
 
     Returns:
         The cell of each Gaussian, numbered from 0 by category, and the label id of each cell.
     """
-    labels, column, sizes = np.unique(label_ids, return_inverse=True, return_counts=True)
+    labels, column = np.unique(label_ids, return_inverse=True)
     places = contracted(means)
+    inside = np.ones(len(means), bool) if inside is None else inside
+    total = max(int(inside.sum()), 1)
     cells, label_of = np.empty(len(means), np.int16), dict[int, int]()
-    for number, (label, size) in enumerate(zip(labels.tolist(), sizes.tolist(), strict=True)):
+    for number, label in enumerate(labels.tolist()):
         rows = np.flatnonzero(column == number)
-        parts = max(min(round(count * size / len(means)), size // FEWEST), 1)
-        nearest = _nearest_centres(places[rows], parts)
+        counted = rows[inside[rows]]
+        parts = max(min(round(count * len(counted) / total), len(counted) // FEWEST), 1)
+        nearest = _nearest_centres(places[rows], places[counted], parts)
         _, own = np.unique(nearest, return_inverse=True)  # a centre may be nearest to none
         cells[rows] = len(label_of) + own
         label_of |= dict.fromkeys(range(len(label_of), len(label_of) + int(own.max()) + 1), label)
@@ -64,11 +72,13 @@ def contracted(means: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     return scaled / far * (2 - 1 / far)
 
 
-def _nearest_centres(places: Float[np.ndarray, "n 3"], parts: int) -> Int[np.ndarray, " n"]:
-    """The nearest of `parts` centres found by k-means; the same input gives the same."""
+def _nearest_centres(
+    places: Float[np.ndarray, "n 3"], counted: Float[np.ndarray, "m 3"], parts: int
+) -> Int[np.ndarray, " n"]:
+    """The nearest of `parts` centres, found by k-means among those counted; always the same."""
     if parts == 1:
         return np.zeros(len(places), np.int64)
-    some = places[np.linspace(0, len(places) - 1, min(len(places), _SAMPLE)).astype(int)]
+    some = counted[np.linspace(0, len(counted) - 1, min(len(counted), _SAMPLE)).astype(int)]
     parts = min(parts, len(np.unique(some, axis=0)))  # equal places are no two centres
     centres, _ = k_means(some, parts)
     squares = [((places - centre) ** 2).sum(1) for centre in centres]

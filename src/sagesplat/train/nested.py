@@ -118,15 +118,18 @@ def order(
     return Nested(g.select(torch.from_numpy(rows)), of_base[rows])
 
 
-def in_cells(nested: Nested, count: int) -> tuple[Nested, dict[int, int]]:
+def in_cells(
+    nested: Nested, count: int, inside: Bool[np.ndarray, " N"] | None = None
+) -> tuple[Nested, dict[int, int]]:
     """An ordered model split into about `count` cells, and the label id of each; the order within them stays.
 
-    The label ids of its Gaussians are then those of cells. 0: a category is a cell, of the same id.
+    The label ids of its Gaussians are then those of cells. 0: a category is a cell, of the same id. `inside`
+    as in `split_cells`.
     """
     g = nested.gaussians
     if not count:
         return nested, {label: label for label in g.counts()}
-    cells, label_of = split_cells(g.means.numpy(), g.label_ids.numpy(), count)
+    cells, label_of = split_cells(g.means.numpy(), g.label_ids.numpy(), count, inside)
     rows = np.argsort(cells, kind="stable")
     order = torch.from_numpy(rows)
     g = replace(g.select(order), label_ids=torch.from_numpy(cells[rows]))

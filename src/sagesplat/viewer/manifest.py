@@ -55,7 +55,7 @@ class Category:
     """A category in a bundle: all that its manifest entry needs besides the increments."""
 
     label_id: int
-    name: str  # in the taxonomy; CATEGORY@BLOCK in a scene in blocks
+    name: str  # in the taxonomy
     title: str  # display name
     color: str  # #rrggbb
     weight: float = 1.0

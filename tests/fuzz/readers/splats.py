@@ -22,6 +22,7 @@ from sagesplat.formats.stream_increments import read_streams
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.lift import LiftedLabels
+from sagesplat.train.boundaries import BlockLevels, read_block, write_block
 from sagesplat.train.checkpoint import latest_checkpoint, write_checkpoint
 from sagesplat.train.state import initial_state
 from sagesplat.train.view_parameters import ViewParameters
@@ -143,6 +144,11 @@ def _read_nested(path: Path) -> None:
     ladder.load(ladder.levels[-1])
 
 
+def _block(folder: Path, size: int) -> list[bytes]:
+    block = BlockLevels(splats(3 * size), {2: (1, 3 * size - 1), 5: (0, 1)}, {2: 3, 5: 184})
+    return [written(folder / "b.npz", lambda path: write_block(path, block, 7))]
+
+
 def _lifted(folder: Path, size: int) -> list[bytes]:
     count = np.ones(4 * size, np.int32)
     (folder / "points").write_text(str(len(count)))
@@ -175,6 +181,7 @@ READERS = (
     Reader("stream", ".sgst", _streams, _read_streams, 10_000),
     Reader("chunks", ".json", _index, file("index.json", _read_index)),
     Reader("checkpoint", ".npz", checkpoints, file("c.npz", _read_checkpoint)),
+    Reader("block-levels", ".npz", _block, file("b.npz", read_block)),
     Reader("level", ".npz", _levels, file("000007.npz", _read_level)),
     Reader("snapshots", ".npz", _levels, file("levels/000007.npz", _read_snapshots)),
     Reader("nested", ".npz", _nested, file("n.npz", _read_nested)),

@@ -150,9 +150,7 @@ def _of_run(path: Path, name: str) -> list[Level]:
     if not (run.increments / INDEX).exists():
         raise RunError(f"{path}: a run without nested levels; finish it with `sagesplat run`")
     antialiased = bool(settings_of(run, "train")["antialiased"])
-    in_blocks = (run.block_labels / "labels.json").exists()
-    apart = (run.instances / "labels.json").exists()
-    folder = run.block_labels if in_blocks else run.instances if apart else run.masks
+    folder = run.instances if run.has_instances else run.masks
     names = titles(Taxonomy.read(folder / "labels.json").names)
     offset = read_capture(run.scene).offset
     return _of_chunks(run.increments, read_index(run.increments), names, name, antialiased, offset)
