@@ -19,7 +19,7 @@ from sagesplat.adapt.bound_plans import (
     quality_of_cells,
 )
 from sagesplat.adapt.calibrate import fewest_views
-from sagesplat.adapt.cell_models import Expected, FidelityModel, expect, write_fidelity
+from sagesplat.adapt.cell_models import Expected, FidelityModel, expect, promised, write_fidelity
 from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
@@ -165,9 +165,14 @@ class NestedLevels(Method):
             lines.append(f"{name}: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))
         return [*lines, f"for {in_words(viewpoints_of(self.job))}"]
 
-    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
+    def predicted(self, plan: Plan, label_id: int, row: int) -> float:
         """See `Method`."""
-        return float(self.qualities[quality].bound[row, self.costs.labels.index(label_id), level - 1])
+        column = self.costs.labels.index(label_id)
+        if plan.cells is None or plan.quality == "ssim":
+            return float(self.qualities[plan.quality].bound[row, column, plan.levels[label_id] - 1])
+        here = self._expected.at(row)
+        levels = np.array([[plan.cells[cell] for cell in here.cells.tolist()]])
+        return float(promised(self.fidelity, here, here.of_composition(levels))[0, column])
 
     def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
