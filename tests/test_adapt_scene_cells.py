@@ -87,3 +87,6 @@ def test_what_a_composition_misses_is_said() -> None:
     assert missed == {3: pytest.approx(0.05)}
     assert [choice.calibrated for choice in plan.choices] == [False, True]
     assert plan.levels == equal.levels
+    one = np.where(np.arange(20) == 3, 0.79, 0.85)[:, None] * np.ones(2)  # in 20 viewpoints, 19 of 20
+    assert measured_in_composition(equal, one)[1] == {}
+    assert measured_in_composition(equal, one, proven=False)[1] == dict.fromkeys((3, 7), pytest.approx(0.01))

@@ -118,17 +118,20 @@ def raise_failing_levels(
     return replace(plan, choices=tuple(map(partial(_at_level, costs), plan.choices, raised.tolist()))), False
 
 
-def measured_in_composition(plan: Plan, measured: Float[np.ndarray, "V L"]) -> tuple[Plan, dict[int, float]]:
+def measured_in_composition(
+    plan: Plan, measured: Float[np.ndarray, "V L"], *, proven: bool = True
+) -> tuple[Plan, dict[int, float]]:
     """A plan of a scene with what its composition measures, and by how much categories miss the target.
 
-    `measured` is that of `raise_failing_levels`.
+    `measured` is that of `raise_failing_levels`. Of a plan that nothing else has `proven` for new viewpoints,
+    as many must keep the target as split conformal prediction asks for.
     """
     assert plan.share is not None
     choices, missed = [], dict[int, float]()
     for i, choice in enumerate(plan.choices):
         values = measured[np.isfinite(measured[:, i]), i]
         if choice.status == "ok" and plan.share < 1 and len(values) >= fewest_views(plan.share):
-            needed = math.ceil(len(values) * plan.share - 1e-9)
+            needed = math.ceil((len(values) + (not proven)) * plan.share - 1e-9)
             least = float(np.sort(values)[len(values) - needed])
             here = reached(values >= plan.target)
             choice = replace(choice, predicted=least, reached=here, calibrated=least >= plan.target)

@@ -256,7 +256,7 @@ class NestedLevels(Method):
                 break
             measured = self._in_composition(list(tried.values()), cameras)
             for j, (i, plan) in enumerate(tried.items()):
-                plan, missed = measured_in_composition(plan, measured[:, j])
+                plan, missed = measured_in_composition(plan, measured[:, j], proven=False)
                 for label, by in missed.items():
                     reaching[i][label] += by
                 if not missed:
