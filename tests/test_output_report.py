@@ -269,6 +269,7 @@ def whole_page() -> ReportData:
         links=[("Its bundle", "../../bundle/index.html"), ("The paper's tables", "paper/index.html")],
         place=place,
         drawn=drawn,
+        planned={label: values[:, 1] for label, values in drawn.items()},
         drawn_at=Place(place.points, place.colours, place.at[:10], place.towards[:10]),
         looks=[(0.9, np.full((8, 12, 3), 90, np.uint8)), (1.0, np.full((8, 12, 3), 99, np.uint8))],
         promise=PromiseFacts(0.95, 57, 27, 83, "screens of 0.5 to 2 times the photos' focal length"),
@@ -488,14 +489,9 @@ def test_the_map_of_viewpoints_counts_what_reaches_the_target():
         0.95,
         quality="fidelity",
     )
-    drawn = {
-        3: np.array([[0.8, 0.95], [0.8, 0.85], [nan, nan]], np.float32),
-        7: np.array([[0.8, 0.95], [nan, nan], [nan, nan]], np.float32),
-    }
-    data = dataclasses.replace(whole_page(), drawn=drawn, counts={(3, 1): 2, (3, 2): 5, (7, 1): 2, (7, 2): 5})
+    planned = {3: np.array([0.95, 0.85, nan], np.float32), 7: np.array([0.8, nan, nan], np.float32)}
+    data = dataclasses.replace(whole_page(), planned=planned)
     np.testing.assert_array_equal(report_figures._reached(data, plan), [0.5, 0.0, nan])
-    others = dataclasses.replace(plan, choices=())
-    np.testing.assert_array_equal(report_figures._reached(data, others), [nan, nan, nan])
 
 
 def test_long_names_have_legends_too(tmp_path, monkeypatch):

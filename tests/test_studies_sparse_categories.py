@@ -123,7 +123,7 @@ def _check_what_is_missing(job: Job) -> None:
     for plan in view_plans:  # what is evaluated is what was planned with, without SfM points as well
         assert plan.view is not None
         for c in plan.choices:
-            found = method.predicted("ssim", c.label_id, c.level, plan.view)
+            found = method.predicted(plan, c.label_id, plan.view)
             assert found == pytest.approx(c.predicted, nan_ok=True)
     evaluation = read_evaluation(job.run.evaluation)
     assert set(evaluation.view) == set(TESTS)

@@ -111,7 +111,7 @@ def evaluate(
     masks: LabelImages,
     ladder: Ladder,
     plans: Sequence[Plan],
-    predicted: Callable[[QualityKind, int, int, int], float],
+    predicted: Callable[[Plan, int, int], float],
     *,
     others: Mapping[str, Similarity] | None = None,
     uniform: Sequence[int] = (),
@@ -130,7 +130,7 @@ def evaluate(
         masks: Label images, [H, W] of category ids; indexed by view.
         ladder: The levels.
         plans: What to compose.
-        predicted: What is expected of (quality, label id, level, row of `Scene.views`); NaN: none.
+        predicted: What is expected of (plan, label id, row of `Scene.views`); NaN: none.
         others: Of OTHERS, what to measure of whole images (image, photo); None: MS-SSIM.
         uniform: Levels to measure with all categories at that level, to compare the plans with.
         compose: The Gaussians of a plan; None: its levels as they are.
@@ -209,7 +209,7 @@ def evaluate(
                 rows.append({
                     "quality": QUALITIES.index(plan.quality), "target": plan.target,
                     "view": row, "label_id": label, "level": level,
-                    "predicted": predicted(plan.quality, label, level, row) if known else np.nan,
+                    "predicted": predicted(plan, label, row) if known else np.nan,
                     "fidelity": fidelity.get(label, np.nan),
                     "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
                     "full_ssim": of_last[row][label]["ssim"], "full_psnr": of_last[row][label]["psnr"],

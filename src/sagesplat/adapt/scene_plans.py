@@ -105,27 +105,40 @@ def raise_failing_levels(
     Returns:
         The plan, and whether its levels are still the same.
     """
-    assert plan.share is not None
-    choices, failing = [], []
-    for i, choice in enumerate(plan.choices):
-        values = measured[np.isfinite(measured[:, i]), i]
-        if choice.status == "ok" and plan.share < 1 and len(values) >= fewest_views(plan.share):
-            needed = math.ceil(len(values) * plan.share - 1e-9)
-            least = float(np.sort(values)[len(values) - needed])
-            here = reached(values >= plan.target)
-            choice = replace(choice, predicted=least, reached=here, calibrated=least >= plan.target)
-            failing += [i] if least < plan.target else []
-        choices.append(choice)
-    levels = np.array([choice.level - 1 for choice in choices])
+    plan, missed = measured_in_composition(plan, measured)
+    levels = np.array([choice.level - 1 for choice in plan.choices])
     top = costs.count.shape[1] - 1
-    up = np.isin(np.arange(len(levels)), failing)
+    up = np.array([choice.label_id in missed for choice in plan.choices], bool)
     if (levels[up] == top).any():  # what is at its top already misses by its neighbours
         up[:] = True
     raised = np.where(up & (levels < top), levels + 1, levels)
     if last or (raised == levels).all():
-        return replace(plan, choices=tuple(choices)), True
+        return plan, True
     raised = fill(raised, np.maximum.accumulate(mean, 1), costs.transfer_bytes, pixels, LOWEST)
-    return replace(plan, choices=tuple(map(partial(_at_level, costs), choices, raised.tolist()))), False
+    return replace(plan, choices=tuple(map(partial(_at_level, costs), plan.choices, raised.tolist()))), False
+
+
+def measured_in_composition(
+    plan: Plan, measured: Float[np.ndarray, "V L"], *, proven: bool = True
+) -> tuple[Plan, dict[int, float]]:
+    """A plan of a scene with what its composition measures, and by how much categories miss the target.
+
+    `measured` is that of `raise_failing_levels`. Of a plan that nothing else has `proven` for new viewpoints,
+    as many must keep the target as split conformal prediction asks for.
+    """
+    assert plan.share is not None
+    choices, missed = [], dict[int, float]()
+    for i, choice in enumerate(plan.choices):
+        values = measured[np.isfinite(measured[:, i]), i]
+        if choice.status == "ok" and plan.share < 1 and len(values) >= fewest_views(plan.share):
+            needed = math.ceil((len(values) + (not proven)) * plan.share - 1e-9)
+            least = float(np.sort(values)[len(values) - needed])
+            here = reached(values >= plan.target)
+            choice = replace(choice, predicted=least, reached=here, calibrated=least >= plan.target)
+            if least < plan.target:
+                missed[choice.label_id] = plan.target - least
+        choices.append(choice)
+    return replace(plan, choices=tuple(choices)), missed
 
 
 def _at_level(costs: Costs, choice: Choice, column: int) -> Choice:

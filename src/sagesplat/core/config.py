@@ -215,7 +215,7 @@ class AdoptConfig:
 
     fit: Literal["renders", "none"] = "renders"
     """Lower levels. renders: merged Gaussians, trained on the splat's own renders; none: merged Gaussians,
-    without training."""
+    fitted to some renders in a few passes."""
     steps: Int31 = 3000
     """Training steps on compositions of the lower levels."""
     shares: LevelShares = (0.004, 0.008, 0.016, 0.031, 0.0625, 0.125, 0.25, 0.5, 0.7, 1.0)

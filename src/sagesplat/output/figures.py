@@ -335,6 +335,8 @@ def quality_over_size(
         axes.plot(size, lowest[[levels.index(level) for level in uniform]], "--", color=FAINT)
         planned = [
             min(means[label][levels.index(level)] for label, level in plan.levels.items() if label in means)
+            if plan.cells is None
+            else np.nan  # only equal levels of cells were measured there
             for _, _, plan in composed
         ]
         axes.plot(at, planned, "--", color=ACCENT)

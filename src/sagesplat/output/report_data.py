@@ -68,6 +68,8 @@ class ReportData:
     promise: PromiseFacts | None = None
     drawn: Mapping[int, Float32[np.ndarray, "V K"]] = field(default_factory=dict)
     """Fidelity by label id: of each level, at drawn viewpoints; NaN where one shows too little of it."""
+    planned: Mapping[int, Float32[np.ndarray, " V"]] = field(default_factory=dict)
+    """The same of the levels of the plan that the page leads with; those of cells are added up."""
     drawn_at: Place | None = None  # those viewpoints from above
     looks: Sequence[tuple[float, UInt8[np.ndarray, "h w 3"]]] = ()  # fidelity, part of a picture
 

@@ -36,7 +36,7 @@ def report_figures(data: ReportData, labels: Sequence[int]) -> Iterator[tuple[st
                 data.drawn, levels, data.sizes, main_plan(data), labels, names, colours
             ),
         )
-    if data.drawn and data.drawn_at is not None:
+    if data.planned and data.drawn_at is not None:
         share = _reached(data, main_plan(data))
         yield "viewpoints", "Map of the drawn viewpoints", place_figures.viewpoint_map(data.drawn_at, share)
     if len(data.evaluation):
@@ -93,9 +93,7 @@ def _uniform(data: ReportData) -> dict[int, float]:
 
 def _reached(data: ReportData, plan: Plan) -> Float[np.ndarray, " V"]:
     """Share of the categories that reach the target at each drawn viewpoint, at the plan's levels."""
-    levels, at = sorted({level for _, level in data.counts}), plan.levels
-    none = np.full((len(next(iter(data.drawn.values()))), 0), np.nan)
-    measured = np.column_stack([none, *(v[:, levels.index(at[i])] for i, v in data.drawn.items() if i in at)])
+    measured = np.column_stack([*data.planned.values()])
     known = np.isfinite(measured)
     counts = known.sum(1)
     return np.where(counts > 0, (known & (measured >= plan.target)).sum(1) / np.maximum(counts, 1), np.nan)

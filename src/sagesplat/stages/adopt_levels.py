@@ -49,12 +49,12 @@ from sagesplat.train.lower_levels import (
 )
 from sagesplat.train.memory import photo_cache
 from sagesplat.train.nested import Nested, NestStep
-from sagesplat.train.refit import refit_colors, refit_coverage
+from sagesplat.train.refit import fit_to_renders, refit_coverage
 
 _WEIGH = 32  # views that importance is measured in
-_REFIT = 24  # views that colours are fitted to, and trained sets are ordered by
+_REFIT = 24  # views that merged sets are fitted to, and trained ones are ordered by
 _TRAINED = 0.5  # largest share that is trained
-_SMALL = 0.1  # share up to which colours take more rounds: little is left as it was, and rounds are cheap
+_SMALL = 0.1  # share up to which the fit takes more and larger steps: little is left as it was
 _KEPT = 0.999  # SSIM of the last level to what came in, from which it looks the same
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
 
@@ -121,18 +121,20 @@ def _lower_levels(
         rung.share: rung.gaussians if number < merges else pruned[number] for number, rung in enumerate(small)
     }
     sets = _trained(job, targets, starts, config, key) if starts else []
-    return sets + [whole(_colored(job, targets, rung)) for rung in rungs[len(small) : merges]]
+    return sets + [whole(_fitted(job, targets, rung)) for rung in rungs[len(small) : merges]]
 
 
-def _colored(job: Job, targets: Photos, rung: Rung) -> Gaussians:
+def _fitted(job: Job, targets: Photos, rung: Rung) -> Gaussians:
     rows = spread(job.scene.train_ids.tolist(), _REFIT)
     cameras = [job.scene.views[row].camera for row in rows]
     device = device_of(job.backend)
     images = [torch.from_numpy(as_unit(targets[row])).to(device) for row in rows]
-    rounds, g = 5 if rung.share <= _SMALL else 3, rung.gaussians.to(device)
-    return refit_colors(g, cameras, images, rounds, antialiased=job.antialiased, backend=job.backend).to(
-        "cpu"
-    )
+    passes, rate = (5, 2.0) if rung.share <= _SMALL else (3, 1.0)
+    fitted = fit_to_renders(
+        rung.gaussians.to(device), cameras, images, passes, rate, antialiased=job.antialiased,
+        backend=job.backend,
+    )  # fmt: skip
+    return fitted.to("cpu")
 
 
 def _merges_until(job: Job, targets: Photos, merged: Sequence[Gaussians], pruned: Sequence[Gaussians]) -> int:

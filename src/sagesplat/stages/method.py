@@ -38,8 +38,8 @@ class Method(Protocol):
     def check(self, config: PlanConfig) -> None:
         """RunError for a plan that cannot be made of these levels."""
 
-    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
-        """Quality that plans count on in a view (row of Scene.views); NaN where nothing is promised."""
+    def predicted(self, plan: Plan, label_id: int, row: int) -> float:
+        """Quality that a plan counts on in a view (row of Scene.views); NaN where nothing is promised."""
         ...
 
     def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:

@@ -18,12 +18,14 @@ from sagesplat.adapt.bound_plans import (
     quality_at,
     quality_of_cells,
 )
-from sagesplat.adapt.cell_models import Expected, FidelityModel, expect, write_fidelity
+from sagesplat.adapt.calibrate import fewest_views
+from sagesplat.adapt.cell_models import Expected, FidelityModel, expect, promised, write_fidelity
 from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan
-from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels
+from sagesplat.adapt.scene_cells import thinned
+from sagesplat.adapt.scene_plans import measured_in_composition, plan_for_scene, raise_failing_levels
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel, write_promises
 from sagesplat.adapt.viewpoints import in_words
 from sagesplat.core.config import FitConfig, LadderKind, PlanConfig
@@ -163,9 +165,14 @@ class NestedLevels(Method):
             lines.append(f"{name}: " + ", ".join(f"{statuses.count(s)} {s}" for s in sorted(set(statuses))))
         return [*lines, f"for {in_words(viewpoints_of(self.job))}"]
 
-    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
+    def predicted(self, plan: Plan, label_id: int, row: int) -> float:
         """See `Method`."""
-        return float(self.qualities[quality].bound[row, self.costs.labels.index(label_id), level - 1])
+        column = self.costs.labels.index(label_id)
+        if plan.cells is None or plan.quality == "ssim":
+            return float(self.qualities[plan.quality].bound[row, column, plan.levels[label_id] - 1])
+        here = self._expected.at(row)
+        levels = np.array([[plan.cells[cell] for cell in here.cells.tolist()]])
+        return float(promised(self.fidelity, here, here.of_composition(levels))[0, column])
 
     def plan_view(self, row: int, target: float, quality: QualityKind = "ssim") -> Plan:
         """See `Method`."""
@@ -207,7 +214,9 @@ class NestedLevels(Method):
         plans = [self.plan_scene(target, share, quality) for quality, target in targets]
         drawn, mean_and_pixels = viewpoints_of(self.job), pooled(*self.sampled)
         cameras = [drawn.cameras[row] for row in drawn.rows("bias")]
-        open_ones = [i for i, plan in enumerate(plans) if plan.quality == "fidelity"]
+        fewer = self._thinned(plans, share, cameras)
+        plans = [fewer.get(i, plan) for i, plan in enumerate(plans)]
+        open_ones = [i for i, plan in enumerate(plans) if plan.quality == "fidelity" and i not in fewer]
         for left in reversed(range(_RAISES + 1)):
             if not open_ones or not cameras:
                 break
@@ -220,10 +229,48 @@ class NestedLevels(Method):
             open_ones = [i for i in open_ones if not found[i][1]]
         return plans
 
+    def _thinned(self, plans: Sequence[Plan], share: float, cameras: Sequence[Camera]) -> dict[int, Plan]:
+        """Plans for fidelity by cell, by their place: those that hold in their compositions at `cameras`.
+
+        A category that misses its target there is asked for more, by what it misses.
+        """
+        job, found = self.job, dict[int, Plan]()
+        if len(self.cell_costs.labels) == len(self.costs.labels) or len(cameras) < fewest_views(share):
+            return found
+        sampled = sampled_of(job)
+        shown = sampled.by_label(job.cells.label_of).shown()
+        pixels = sampled.pixels * shown[:, np.unique(job.cells.labels, return_inverse=True)[1]]
+        reaching = {
+            i: {c.label_id: plan.target for c in plan.choices if c.status == "ok"}
+            for i, plan in enumerate(plans)
+            if plan.quality == "fidelity" and share < 1
+        }
+        for _ in range(_RAISES):
+            tried = {
+                i: thinned(
+                    plans[i], sampled.fidelity, pixels, self.cell_costs, job.cells.label_of, asked
+                )
+                for i, asked in reaching.items()
+            }  # fmt: skip
+            if not tried:
+                break
+            measured = self._in_composition(list(tried.values()), cameras)
+            for j, (i, plan) in enumerate(tried.items()):
+                plan, missed = measured_in_composition(plan, measured[:, j], proven=False)
+                for label, by in missed.items():
+                    reaching[i][label] += by
+                if not missed:
+                    found[i] = plan
+                    del reaching[i]
+        return found
+
     def _in_composition(self, plans: Sequence[Plan], cameras: Sequence[Camera]) -> np.ndarray:
         """Fidelity of each category in each plan's composition, [V, J, L]; NaN where it shows too little."""
-        label_of = self.job.cells.labels.tolist()
-        levels = np.array([[plan.levels[label] for label in label_of] for plan in plans])
+        label_of = self.job.cells.label_of
+        levels = np.array([
+            [plan.cells[cell] if plan.cells else plan.levels[label] for cell, label in label_of.items()]
+            for plan in plans
+        ])  # fmt: skip
         planned = np.broadcast_to(levels, (len(cameras), *levels.shape))
         fidelity, pixels = compositions_at(self.job, cameras, planned, "plan")
         shown = shown_enough(pixels, cameras)

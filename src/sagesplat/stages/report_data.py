@@ -13,9 +13,11 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from sagesplat import __version__
+from sagesplat.adapt.fidelity import pooled_cells
 from sagesplat.adapt.free_poses import level_axes
 from sagesplat.adapt.ladder import NestedLadder
 from sagesplat.adapt.observe import as_unit, measure_total, render_rgb
+from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.adapt.viewpoints import SETS, in_words
 from sagesplat.core.config import LadderKind
@@ -36,6 +38,7 @@ from sagesplat.scene.scene import Camera
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.methods import method_of
+from sagesplat.stages.plan import scene_plan
 from sagesplat.stages.results import (
     evaluation_of,
     fidelity_of,
@@ -68,7 +71,7 @@ def report_data(
     """
     run, scene, masks, ladder = job.run, job.scene, job.level_masks, job.ladder
     names = {**masks.taxonomy.names, UNLABELLED: masks.taxonomy.name(UNLABELLED)}
-    promise, drawn = _promise(job)
+    promise, drawn, planned = _promise(job, scene_plan(job, quality, target))
     sets = viewpoints_of(job) if promise else None
     beside = settings_of(run, "plan")["target_ssim"] if quality == "fidelity" else None
     records = {path.stem: read_record(path) for path in stage_records(run)}
@@ -106,6 +109,7 @@ def report_data(
         place=_place(job, [view.camera for view in scene.views]),
         promise=promise,
         drawn=drawn,
+        planned=planned,
         drawn_at=_place(job, [sets.cameras[row] for row in sets.rows("fit")]) if sets else None,
         looks=_looks(job) if sets else (),
     )
@@ -184,13 +188,16 @@ def _place(job: Job, cameras: Sequence[Camera]) -> Place:
     )
 
 
-def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
-    """What bounds of fidelity were made from, and the fidelity at drawn viewpoints by label id."""
+def _promise(
+    job: Job, plan: Plan
+) -> tuple[PromiseFacts | None, dict[int, np.ndarray], dict[int, np.ndarray]]:
+    """Facts of the bounds of fidelity; the fidelity at drawn viewpoints by label id, and that of the plan."""
     run = job.run
     if not (run.ladder == "nested" and run.sampled.exists() and run.fidelity.exists()):
-        return None, {}
+        return None, {}, {}
     models, sets = fidelity_of(job), viewpoints_of(job)
-    sampled = sampled_of(job).by_label(job.cells.label_of)
+    by_cell, cells = sampled_of(job), job.cells
+    sampled = by_cell.by_label(cells.label_of)
     confidence = min((model.confidence for model in models.values()), default=0.0)
     fitted, composed, calibration = (len(sets.rows(name)) for name in SETS)
     facts = PromiseFacts(confidence, fitted, composed, calibration, in_words(sets))
@@ -200,7 +207,17 @@ def _promise(job: Job) -> tuple[PromiseFacts | None, dict[int, np.ndarray]]:
         for column, label in enumerate(sampled.labels)
         if shown[:, column].any()
     }
-    return facts, drawn
+    of_cells = plan.cells or {cell: plan.levels[label] for cell, label in cells.label_of.items()}
+    columns = np.array([of_cells[cell] for cell in by_cell.labels]) - 1
+    taken = by_cell.fidelity[:, np.arange(len(columns)), columns]
+    member = cells.labels[:, None] == np.array(sampled.labels)
+    at_plan = pooled_cells(taken[:, None], by_cell.pixels, member)[:, 0]
+    planned = {
+        label: np.where(shown[:, column], at_plan[:, column], np.float32(np.nan))
+        for column, label in enumerate(sampled.labels)
+        if label in drawn
+    }
+    return facts, drawn, planned
 
 
 def _looks(job: Job) -> list[tuple[float, np.ndarray]]:

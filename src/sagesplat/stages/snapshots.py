@@ -50,9 +50,9 @@ class Snapshots(Method):
         if config.budget:
             self.plan_budget(config)
 
-    def predicted(self, quality: QualityKind, label_id: int, level: int, row: int) -> float:
+    def predicted(self, plan: Plan, label_id: int, row: int) -> float:
         """See `Method`."""
-        model = self._models.get((label_id, level))
+        model = self._models.get((label_id, plan.levels[label_id]))
         return model(self._distance(label_id, row)) if model else np.nan
 
     def _distance(self, label_id: int, row: int) -> float:

@@ -1,4 +1,4 @@
-"""Fits merged Gaussians to renders without gradient descent: first what each covers, then its colour."""
+"""Fits merged Gaussians to renders in seconds: first what each covers, then all of it in a few passes."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,7 +9,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.core.sh import C0
+from sagesplat.metrics.image import photometric_loss
 from sagesplat.raster import Backend, Workspace, rasterize
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.train.importance import importance
@@ -19,6 +19,14 @@ _MOST = 2.0  # largest correction of an opacity
 _GROWS = 1.5  # largest growth of an area, where the opacity is as large as it can be
 _LEAST = 1e-3, 0.1  # opacity; blending weight, in pixels, that corrections are relative to
 _OPAQUE = 0.99
+_RATES = {
+    "sh0": 0.02,
+    "logit_opacities": 0.05,
+    "log_scales": 0.02,
+    "quats": 0.01,
+    "means": 0.05,
+}  # means: of a size
+_BETAS = 0.5, 0.9  # there are few steps
 
 
 def refit_coverage(
@@ -43,36 +51,50 @@ def refit_coverage(
     return replace(g, logit_opacities=torch.logit(possible), log_scales=g.log_scales + grows[:, None])
 
 
-def refit_colors(
+def fit_to_renders(
     g: Gaussians,
     cameras: Sequence[Camera],
     images: Sequence[Float32[Tensor, "H W 3"]],
-    rounds: int = 3,
+    passes: int = 3,
+    rate: float = 1.0,
     *,
     antialiased: bool = False,
     backend: Backend = "auto",
 ) -> Gaussians:
-    """Colours of degree 0 of least squares to `images`, by Jacobi's iteration (SIRT).
+    """Everything but the higher SH coefficients, fitted to `images` in a few passes over them.
 
-    A picture is linear in the colours; each round moves a colour by the mean difference of the pixels that a
-    Gaussian paints, weighted by how much it paints of them.
+    Each image moves the Gaussians by a step of Adam down the loss of 3DGS, with rates that fall to 0 as a
+    cosine. What has smaller gradients than most moves less than in Adam: of a large level most Gaussians are
+    as they came in, and need no fit.
+
+    Args:
+        g: Merged Gaussians.
+        cameras: Of the images.
+        images: Renders of what was merged, on the device of `g`.
+        passes: Over all images.
+        rate: Multiplies the rates; 1 for levels of which most did not merge.
+        antialiased: How the Gaussians are drawn.
+        backend: Rasteriser.
     """
-    workspace = Workspace()
-    painted = torch.zeros(len(g), 1, 1, device=g.means.device)
-    for turn in range(rounds):
-        moved = torch.zeros_like(g.sh0)
-        for camera, image in zip(cameras, images, strict=True):
-            sh0 = g.sh0.clone().requires_grad_()
-            if turn == 0:  # how much each paints does not change with its colour
-                rgb = rasterize(
-                    replace(g, sh0=sh0), camera, backend=backend, antialiased=antialiased, workspace=workspace
-                ).rgb
-                (grad,) = torch.autograd.grad(rgb.sum(), sh0)
-                painted += grad.amax(2, keepdim=True) / C0  # a channel that is clipped at black has none
-            rgb = rasterize(
-                replace(g, sh0=sh0), camera, backend=backend, antialiased=antialiased, workspace=workspace
-            ).rgb
-            (grad,) = torch.autograd.grad(rgb, sh0, image - rgb.detach())
-            moved += grad
-        g = replace(g, sh0=g.sh0 + moved / (C0**2 * (painted + _LEAST[1])))
-    return g
+    values = {name: getattr(g, name).clone().requires_grad_() for name in _RATES}
+    sizes = torch.exp(g.log_scales).mean(1, keepdim=True)
+    first = {name: torch.zeros_like(value) for name, value in values.items()}
+    second = {name: torch.zeros_like(value) for name, value in values.items()}
+    order, workspace, steps = np.random.default_rng(0), Workspace(), passes * len(cameras)
+    for step in range(steps):
+        if step % len(cameras) == 0:
+            rows = order.permutation(len(cameras))
+        row = rows[step % len(cameras)]
+        rgb = rasterize(
+            replace(g, **values), cameras[row], backend=backend, antialiased=antialiased, workspace=workspace
+        ).rgb
+        grads = torch.autograd.grad(photometric_loss(rgb, images[row]), list(values.values()))
+        falling = rate * (1 + np.cos(np.pi * (step + 1) / steps)) / 2
+        for (name, value), grad in zip(values.items(), grads, strict=True):
+            first[name].lerp_(grad, 1 - _BETAS[0])
+            second[name].lerp_(grad**2, 1 - _BETAS[1])
+            mean = first[name] / (1 - _BETAS[0] ** (step + 1))
+            square = (second[name] + second[name].mean()) / (1 - _BETAS[1] ** (step + 1))
+            moved = falling * _RATES[name] * mean / (square.sqrt() + 1e-15)
+            value.data -= moved * sizes if name == "means" else moved
+    return replace(g, **{name: value.detach() for name, value in values.items()})
