@@ -284,6 +284,24 @@ def intersections(
     return records, radii, _intersections(options, records, depths, radii)
 
 
+def seen(
+    g: Gaussians,
+    camera: Camera,
+    workspace: Workspace,
+    *,
+    antialiased: bool = False,
+    tile_mask: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, tiles.Intersections]:
+    """The rows [M] of the Gaussians that are drawn, their records [M, 11] with the colours that the camera
+    sees, and tile lists of places among them. The lists hold until the next call with the same `workspace`.
+    """
+    options = _Options(camera, g.sh_degree, antialiased, tile_mask, workspace)
+    records, depths, radii = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
+    rows = np.flatnonzero(radii > 0)
+    records = records[rows]
+    return rows, records, _intersections(options, records, depths[rows], radii[rows])
+
+
 def most_painted(
     g: Gaussians,
     camera: Camera,
