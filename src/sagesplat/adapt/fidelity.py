@@ -27,7 +27,7 @@ from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 
-_KEEP = 10**9  # bytes of references that are kept
+_KEEP = 5 * 10**8  # bytes of references that are kept
 PROMISED_SHARE = 2e-3  # of a picture that a category has to cover: of fewer pixels nothing is promised
 
 
