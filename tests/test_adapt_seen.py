@@ -8,6 +8,7 @@ import torch
 from conftest import pinhole, random_gaussians
 
 from sagesplat.adapt.ladder import PrefixLadder
+from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.adapt.seen import SeenRecords, seen_from, seen_levels
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.levels import write_set
@@ -38,6 +39,9 @@ def test_compositions_render_alike(tmp_path, two, antialiased):
         np.testing.assert_allclose(seen.render(levels), expected.clamp(0, 1), atol=2e-6)
         np.testing.assert_allclose(fast.render(levels), expected.clamp(0, 1), atol=5e-6)
         assert len(seen.compose(levels)) <= len(ladder.compose(levels))
+        labels = RenderedLabels(ladder.compose(levels), "cpu", antialiased).render(camera)
+        assert (seen.label_ids(levels) == labels).all()
+        assert (fast.label_ids(levels) == labels).mean() > 0.999  # what is equal but for rounding
 
 
 def test_what_is_in_sight_is_what_has_a_radius():

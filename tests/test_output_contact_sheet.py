@@ -29,3 +29,12 @@ def test_names_and_a_cloud_without_extent(tmp_path):
     names = ["庭园$", "a" * 90]
     contact_sheet(tmp_path / "v.png", g, orbit(2), UP, ["庭园 $x_1$"], names)
     assert (tmp_path / "v.png").stat().st_size > 5000
+
+
+def test_renders_that_are_there_are_taken(tmp_path):
+    red = np.full((60, 80, 3), (255, 0, 0), np.uint8)
+    Image.fromarray(red).save(tmp_path / "red.png")
+    made = [tmp_path / "red.png"] * 3
+    contact_sheet(tmp_path / "v.png", random_gaussians(60), orbit(3), UP, rendered=made)
+    pixels = np.asarray(Image.open(tmp_path / "v.png").convert("RGB")).astype(int)
+    assert ((pixels - [255, 0, 0] == 0).all(2)).sum() > 3 * 100 * 80

@@ -2,13 +2,15 @@
 and all gradients.
 """
 
+from dataclasses import replace
+
 import gsplat_standin
 import pytest
 import torch
 from conftest import pinhole, random_gaussians, render_with_gradients
 
-from sagesplat.core.gaussians import Gaussians
-from sagesplat.raster import Backend, set_threads
+from sagesplat.core.gaussians import PARAMETERS, Gaussians
+from sagesplat.raster import Backend, rasterize, set_threads
 from sagesplat.scene.scene import Camera
 
 # of images, and of gradients relative to a parameter's largest; a GPU computes with fast math
@@ -161,3 +163,16 @@ def test_the_order_of_the_rows_does_not_matter():
     assert torch.equal(render.radii[order], shuffled.radii)
     for name, grad in grads.items():
         assert (grad[order] - shuffled_grads[name]).abs().max() <= 1e-6 * grad.abs().max(), name
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("name", ["logit_opacities", "sh0"])
+def test_the_gradient_of_one_parameter_alone_is_that_beside_the_others(name, antialiased):
+    g, camera = random_gaussians(60, logit=1.0), pinhole(50, 40)
+    found = []
+    for names in (PARAMETERS, (name,)):
+        leaf = replace(g, **{n: getattr(g, n).clone().requires_grad_() for n in names})
+        rgb = rasterize(leaf, camera, antialiased=antialiased, backend="cpu").rgb
+        found += torch.autograd.grad(rgb.square().sum(), getattr(leaf, name))
+    assert found[0].abs().max() > 0
+    torch.testing.assert_close(found[1], found[0], rtol=1e-5, atol=1e-6)

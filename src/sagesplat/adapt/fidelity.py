@@ -8,6 +8,7 @@ The full model is the last level; of a splat that was adopted it is what came in
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from sagesplat.io.npz import Npz
 from sagesplat.metrics.image import box_of, means_by_label, ssim_map, tiles_around
 from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera
+from sagesplat.segment.masks import UNLABELLED
 
-_KEEP = 10**9  # bytes of references that are kept
+_KEEP = 5 * 10**8  # bytes of references that are kept
 PROMISED_SHARE = 2e-3  # of a picture that a category has to cover: of fewer pixels nothing is promised
 
 
@@ -203,29 +205,41 @@ class References:
         self.wanted = np.array([only is None or label in only for label in self.labels])
         self._ladder, self._antialiased, self._left = ladder, antialiased, keep
         self._backend: Backend = backend
-        last = ladder.load(ladder.levels[-1]).to(device_of(backend))
-        self._labels = self._full = RenderedLabels(last, backend, antialiased)
-        if full is not None:
-            self._full = RenderedLabels(full.to(device_of(backend)), backend, antialiased)
+        self._given = full
         self._workspace, self._kept = Workspace(), {}
+
+    @cached_property
+    def _last(self) -> RenderedLabels:
+        """The last level by itself: a copy, which is made where the seen levels do not serve."""
+        last = self._ladder.load(self._ladder.levels[-1]).to(device_of(self._backend))
+        return RenderedLabels(last, self._backend, self._antialiased)
+
+    @cached_property
+    def _full(self) -> RenderedLabels:
+        if self._given is None:
+            return self._last
+        return RenderedLabels(self._given.to(device_of(self._backend)), self._backend, self._antialiased)
 
     def at(self, camera: Camera) -> Reference:
         """The full model's image and label image, and its levels, from a viewpoint."""
         key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
         if key in self._kept:
             return self._kept[key]
-        label_ids = self._labels.render(camera)
-        pixels = np.array([(label_ids == label).sum() for label in self.labels], np.int32)
-        tile_mask = None
+        tile_mask, levels, label_ids = None, None, None
         if not self.wanted.all():
+            label_ids = self._last.render(camera)
             tile_mask = tiles_around(np.isin(label_ids, np.array(self.labels)[self.wanted]))
         image = self._full.paint(camera, tile_mask)
-        levels: Seen | None = None
         if isinstance(self._ladder, PrefixLadder):
             levels = seen_from(
                 self._ladder, camera, backend=self._backend, antialiased=self._antialiased,
                 workspace=self._workspace, tile_mask=tile_mask,
             )  # fmt: skip
+        if label_ids is None and levels:
+            label_ids = levels.label_ids(dict.fromkeys(self.labels, self._ladder.levels[-1]))
+        label_ids = self._last.render(camera) if label_ids is None else label_ids
+        counts = np.bincount(label_ids.ravel().astype(np.int64) - UNLABELLED, minlength=2 + max(self.labels))
+        pixels = counts[np.array(self.labels) - UNLABELLED].astype(np.int32)
         found = Reference(image, label_ids, pixels, levels, tile_mask)
         if found.nbytes <= self._left:
             self._left -= found.nbytes

@@ -15,7 +15,7 @@ too, whatever the count.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from sagesplat.adapt.free_space import Cloud, Space, cloud_of, in_units, space_o
 from sagesplat.adapt.upright import upright
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.sh import C0
 from sagesplat.raster import Backend, Workspace, device_of, rasterize
 from sagesplat.raster.render import NEAR
 from sagesplat.scene.loading import MAX_SIDE
@@ -188,10 +189,11 @@ class _Check:
     def __call__(self, w2c: np.ndarray) -> bool:
         camera = Camera(w2c.astype(np.float32), self.camera.K, self.camera.width, self.camera.height)
         position = torch.from_numpy(camera.position.copy()).to(self.g.means.device)
-        near = ((self.g.means - position).norm(dim=1) < CLEAR).float()[:, None]
+        near = ((self.g.means - position).norm(dim=1) < CLEAR).float()
         options: dict[str, Any] = {"sh_degree": 0, "backend": self.backend, "workspace": self.workspace}
-        render = rasterize(self.g, camera, features=near, **options)
-        assert render.features is not None
+        # what is near is white, and the rest black
+        sh0 = ((near - 0.5) / C0)[:, None, None].expand_as(self.g.sh0).contiguous()
+        render = rasterize(replace(self.g, sh0=sh0), camera, **options)
         seen = float(render.alpha.mean())
-        covered, inside = float((render.alpha > 0.5).float().mean()), float(render.features.mean())
+        covered, inside = float((render.alpha > 0.5).float().mean()), float(render.rgb.mean())
         return covered >= self.least and inside <= _MOST_NEAR * seen

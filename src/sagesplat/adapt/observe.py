@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sagesplat.adapt.ladder import Ladder, NestedLadder
 from sagesplat.adapt.seen import seen_from
+from sagesplat.adapt.seen_cpu import drawn_from
 from sagesplat.adapt.viewpoints import LONGEST
 from sagesplat.core import geometry
 from sagesplat.core.gaussians import Gaussians
@@ -173,6 +174,20 @@ class RenderedLabels:
     ) -> Float32[np.ndarray, "H W 3"]:
         """An image of the Gaussians, as of `render_rgb`."""
         return render_rgb(self.gaussians, camera, tile_mask=tile_mask, **self._how)
+
+    def picture(self, camera: Camera) -> tuple[Float32[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"]]:
+        """Both; on a CPU from one projection. The image holds until the next call in the same thread."""
+        if (
+            device_of(self.backend).type != "cpu"
+            or self.backend == "reference"
+            or camera.exposure is not None
+        ):
+            return self.paint(camera), self.render(camera)
+        ids, columns = self._columns
+        drawn, rows = drawn_from(self.gaussians, None, {}, camera, self.antialiased, self._workspace)
+        everything = [(0, len(rows), 0.0)]
+        painted = ids[drawn.most_painted(everything, columns.numpy()[rows], len(ids))]
+        return drawn.render(everything), painted
 
     @property
     def _how(self) -> dict[str, Any]:

@@ -6,15 +6,16 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Int16, Int64
 
 from sagesplat.adapt.ladder import PrefixLadder, composed
 from sagesplat.adapt.seen_cpu import Drawn, drawn_from
 from sagesplat.core import sh
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.raster import Backend, Workspace, device_of, in_sight, rasterize
+from sagesplat.raster import Backend, Workspace, device_of, in_sight, most_painted, rasterize
 from sagesplat.scene.scene import Camera
+from sagesplat.segment.masks import UNLABELLED
 
 Ranges = Mapping[int, tuple[tuple[int, int], ...]]  # first row and last + 1 of each level, by label id
 
@@ -34,6 +35,10 @@ class Seen(Protocol):
         """
         ...
 
+    def label_ids(self, levels: Mapping[int, int]) -> Int16[np.ndarray, "H W"]:
+        """Per pixel the category that paints most of it; -1 where more shines through than that."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class SeenRecords:
@@ -49,12 +54,23 @@ class SeenRecords:
 
     def render(self, levels: Mapping[int, int]) -> Float32[np.ndarray, "H W 3"]:
         """See `Seen`."""
-        parts = [
+        return self.drawn.render(self._parts(levels))
+
+    def label_ids(self, levels: Mapping[int, int]) -> Int16[np.ndarray, "H W"]:
+        """See `Seen`."""
+        ids = sorted({UNLABELLED, *self.ranges})
+        columns = np.zeros(len(self.drawn.records), np.int64)
+        for label, level in levels.items():
+            if label in self.ranges:
+                columns[slice(*self.ranges[label][level - 1])] = ids.index(label)
+        return np.array(ids, np.int16)[self.drawn.most_painted(self._parts(levels), columns, len(ids))]
+
+    def _parts(self, levels: Mapping[int, int]) -> list[tuple[int, int, float]]:
+        return [
             (*of_level[levels[label] - 1], self.drawn.weights[label][levels[label] - 1])
             for label, of_level in self.ranges.items()
             if label in levels
         ]
-        return self.drawn.render(parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +107,16 @@ class SeenLevels:
         with torch.no_grad():
             return rasterize(self.compose(levels), self.camera, **how).rgb.clamp(0, 1).float().cpu().numpy()
 
+    def label_ids(self, levels: Mapping[int, int]) -> Int16[np.ndarray, "H W"]:
+        """See `Seen`."""
+        g = self.compose(levels)
+        ids = torch.tensor(sorted({UNLABELLED, *self.ranges}), device=g.label_ids.device, dtype=torch.int16)
+        painted = most_painted(
+            g, self.camera, torch.searchsorted(ids, g.label_ids), len(ids),
+            antialiased=self.antialiased, backend=self.backend, tile_mask=self.tile_mask,
+        )  # fmt: skip
+        return ids.cpu().numpy()[painted]
+
 
 def seen_from(
     ladder: PrefixLadder,
@@ -106,14 +132,16 @@ def seen_from(
     On a CPU all that have the same workspace render into the same memory. `tile_mask`: tiles of 16 x 16 px
     that images are wanted in.
     """
-    how = {"backend": backend, "antialiased": antialiased, "workspace": workspace, "tile_mask": tile_mask}
-    found = seen_levels(ladder, camera, **how)
-    if backend not in ("auto", "cpu") or camera.exposure is not None or not len(found.gaussians):
-        return found
-    weights = found.second.weights if found.second else {k: (0.0,) * len(v) for k, v in found.ranges.items()}
-    second = found.second.logits if found.second else None
-    drawn = drawn_from(found.gaussians, second, weights, camera, antialiased, workspace, tile_mask)
-    return SeenRecords(drawn, found.ranges)
+    if backend not in ("auto", "cpu") or camera.exposure is not None:
+        return seen_levels(
+            ladder, camera,
+            backend=backend, antialiased=antialiased, workspace=workspace, tile_mask=tile_mask,
+        )  # fmt: skip
+    g, second = ladder.gaussians, ladder.second
+    weights = second.weights if second else {k: (0.0,) * len(v) for k, v in ladder.ranges.items()}
+    logits = second.logits if second else None
+    drawn, rows = drawn_from(g, logits, weights, camera, antialiased, workspace, tile_mask)
+    return SeenRecords(drawn, _ranges_among(ladder, rows))
 
 
 def seen_levels(
@@ -134,16 +162,20 @@ def seen_levels(
         most = replace(g, logit_opacities=g.logit_opacities.maximum(second.logits))
     how = {"antialiased": antialiased, "backend": backend, "workspace": workspace}
     seen = in_sight(most, camera, tile_mask=tile_mask, **how)
-    before = np.concatenate([[0], seen.cpu().numpy().cumsum()])
-    ranges = {
-        label: tuple((int(before[first]), int(before[last])) for first, last in of_level)
-        for label, of_level in ladder.ranges.items()
-    }
     rows = torch.nonzero(seen)[:, 0]
+    ranges = _ranges_among(ladder, rows.cpu().numpy())
     second = second.select(rows) if second else None
     return SeenLevels(
         _as_seen(g.select(rows), camera), second, ranges, camera, backend, antialiased, tile_mask
     )
+
+
+def _ranges_among(ladder: PrefixLadder, rows: Int64[np.ndarray, " M"]) -> Ranges:
+    """The levels of a ladder as ranges among some of its rows, ascending."""
+    return {
+        label: tuple((int(first), int(last)) for first, last in np.searchsorted(rows, of_level))
+        for label, of_level in ladder.ranges.items()
+    }
 
 
 def _as_seen(g: Gaussians, camera: Camera) -> Gaussians:

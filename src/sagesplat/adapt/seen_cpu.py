@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Int, Int32, Int64
 from numba import prange
 from torch import Tensor
 
@@ -14,6 +14,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.kernels.jit import njit
 from sagesplat.kernels.planes import padded, to_image
 from sagesplat.raster import Workspace, blend, cpu
+from sagesplat.raster import weights as weights_of
 from sagesplat.raster.render import ALPHA_MIN
 from sagesplat.scene.scene import Camera
 
@@ -47,6 +48,28 @@ class Drawn:
         """
         camera, take = self.camera, self.workspace.take
         width, height = camera.width, camera.height
+        records, starts, ids = self._composed(parts)
+        image, left = take("image 0", 3, height, padded(width)), take("left", height, padded(width))
+        ends = np.empty(len(starts) - 1, np.int64)
+        behind = np.array(camera.background, np.float32) / 255
+        blend.forward(records, starts, ids, self.row_order, width, height, behind, image, left, ends)
+        return to_image(np.clip(image, 0, 1, out=image), width).numpy()
+
+    def most_painted(
+        self, parts: Sequence[tuple[int, int, float]], columns_of: Int[np.ndarray, " N"], num_columns: int
+    ) -> Int64[np.ndarray, "H W"]:
+        """As `raster.most_painted`, of the same rows as `render`."""
+        out = np.zeros((self.camera.height, self.camera.width), np.int64)
+        records, starts, ids = self._composed(parts)
+        weights_of.most(
+            records, starts, ids, self.row_order, self.camera.width, self.camera.height,
+            columns_of.astype(np.int64), num_columns, out,
+        )  # fmt: skip
+        return out
+
+    def _composed(self, parts: Sequence[tuple[int, int, float]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Records at the opacities of the parts, and the tile lists of what they show."""
+        take = self.workspace.take
         records, shown = (
             take("records", *self.records.shape),
             take("shown", len(self.records), dtype=np.bool_),
@@ -60,11 +83,7 @@ class Drawn:
             )  # fmt: skip
         starts, ids = np.empty_like(self.starts), take("ids", len(self.ids), dtype=np.int32)
         _list_shown(self.starts, self.ids, shown, starts, ids)
-        image, left = take("image 0", 3, height, padded(width)), take("left", height, padded(width))
-        ends = np.empty(len(starts) - 1, np.int64)
-        behind = np.array(camera.background, np.float32) / 255
-        blend.forward(records, starts, ids, self.row_order, width, height, behind, image, left, ends)
-        return to_image(np.clip(image, 0, 1, out=image), width).numpy()
+        return records, starts, ids
 
 
 def drawn_from(
@@ -75,21 +94,19 @@ def drawn_from(
     antialiased: bool,
     workspace: Workspace,
     tile_mask: Bool[np.ndarray, "h w"] | None = None,
-) -> Drawn:
-    """Gaussians without harmonics that `camera` sees, with their `second` opacities (logits [N]), if any."""
+) -> tuple[Drawn, Int64[np.ndarray, " M"]]:
+    """What `camera` sees of Gaussians with their `second` opacities (logits [N]), if any; and their rows."""
     first = g.logit_opacities
     second = first if second is None else second
     most = first.maximum(second)
-    found, _, lists = cpu.intersections(
+    rows, records, lists = cpu.seen(
         replace(g, logit_opacities=most), camera, workspace, antialiased=antialiased, tile_mask=tile_mask
     )
-    records = found.copy()
-    logits = np.stack([first.numpy(), second.numpy()], 1)
-    opacities = 1 / (1 + np.exp(-most.double().numpy()))
+    logits = np.stack([first.numpy()[rows], second.numpy()[rows]], 1)
+    opacities = 1 / (1 + np.exp(-logits.max(1).astype(np.float64)))
     filtered = (records[:, 5] - np.log2(opacities)).astype(np.float32)
-    return Drawn(
-        records, logits, filtered, lists.row_order, lists.starts, lists.ids.copy(), weights, camera, workspace
-    )
+    order, starts, ids = lists.row_order, lists.starts, lists.ids.copy()
+    return Drawn(records, logits, filtered, order, starts, ids, weights, camera, workspace), rows
 
 
 @njit(parallel=True, error_model="numpy", cache=True)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from sagesplat.adapt.free_poses import level_axes
 from sagesplat.adapt.observe import render_rgb
@@ -42,13 +43,15 @@ def contact_sheet(
     *,
     antialiased: bool = False,
     backend: Backend = "cpu",
+    rendered: Sequence[Path] = (),
 ) -> None:
     """Write viewpoints as a PNG: maps from above and from the side, and small renders of the first ones.
 
-    `up`: unit vector, world; `lines`: put over it; `names`: of the cameras; None: their numbers.
+    `up`: unit vector, world; `lines`: put over it; `names`: of the cameras; None: their numbers; `rendered`:
+    the cameras' renders in files, which are made smaller; none: they are rendered.
     """
     shown, workspace = cameras[:MOST], Workspace()
-    pictures = [
+    pictures = [_smaller(path) for path in rendered[:MOST]] or [
         render_rgb(
             g, camera.neutral.within(_SIDE), backend=backend, antialiased=antialiased, workspace=workspace
         ).copy()
@@ -73,6 +76,12 @@ def contact_sheet(
         with warnings.catch_warnings(), atomic_path(path) as temporary:
             warnings.filterwarnings("ignore", message="Glyph .* missing from font")  # names in Chinese
             figure.savefig(temporary, format="png", dpi=100)
+
+
+def _smaller(path: Path) -> Float32[np.ndarray, "H W 3"]:
+    with Image.open(path) as image:
+        image.thumbnail((_SIDE, _SIDE), Image.Resampling.BOX)
+        return np.asarray(image.convert("RGB"), np.float32) / 255
 
 
 def _picture(

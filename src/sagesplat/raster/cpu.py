@@ -18,6 +18,7 @@ from sagesplat.raster.render import Render
 from sagesplat.scene.scene import Camera
 
 _CHUNK = 3  # channels that one blending pass takes
+_WITHOUT_PLACE = {"logit_opacities", "sh0"}  # their gradients need no projection
 
 _Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # PARAMETERS
 
@@ -131,6 +132,7 @@ class _Rasterize(torch.autograd.Function):
         g_features = np.zeros((n, num_features), np.float32)
         rows, reached = space.take("sums", len(found.ids), blend.SUMS), _unreached(found, space)
         to_pose = ctx.needs_input_grad[4]  # all Gaussians that are drawn have their share in it
+        asked = {name for name, needs in zip(PARAMETERS, ctx.needs_input_grad[5:], strict=True) if needs}
         masked = options.trainable is not None and not to_pose
         moved = radii * options.trainable if masked else radii
         g_left, no_left = _gradient_of_left(g_alpha, left, space), left[:0]
@@ -148,6 +150,18 @@ class _Rasterize(torch.autograd.Function):
             if not first:
                 part = g_features[:, _CHUNK * (index - 1) : _CHUNK * index]
                 part[:] = g_channels[:, : part.shape[1]]
+        if (
+            not to_pose
+            and asked <= _WITHOUT_PLACE
+            and not (options.antialiased and "logit_opacities" in asked)
+        ):
+            drawn = (moved > 0)[:, None]
+            d_sh0 = np.where((painted[0][:, 6:9] > 0) & drawn, g_color, 0) * np.float32(sh.C0)
+            opacity = 1 / (1 + np.exp(-arrays[3]))
+            d_logits = np.where(drawn[:, 0], g_opacity * opacity * (1 - opacity), 0)
+            of = {"sh0": torch.from_numpy(d_sh0[:, None]), "logit_opacities": torch.from_numpy(d_logits)}
+            places = torch.from_numpy(g_mean2d), None, torch.from_numpy(g_features), None
+            return None, *places, *(of.get(name) for name in PARAMETERS)
         enough: Any = _enough(*arrays)
         gradients = [space.take(name, *a.shape) for name, a in zip(PARAMETERS, enough, strict=True)]
         num_bases = sh.num_bases(options.degree)
@@ -282,6 +296,24 @@ def intersections(
     options = _Options(camera, 0, antialiased, tile_mask, workspace)
     records, depths, radii = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
     return records, radii, _intersections(options, records, depths, radii)
+
+
+def seen(
+    g: Gaussians,
+    camera: Camera,
+    workspace: Workspace,
+    *,
+    antialiased: bool = False,
+    tile_mask: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, tiles.Intersections]:
+    """The rows [M] of the Gaussians that are drawn, their records [M, 11] with the colours that the camera
+    sees, and tile lists of places among them. The lists hold until the next call with the same `workspace`.
+    """
+    options = _Options(camera, g.sh_degree, antialiased, tile_mask, workspace)
+    records, depths, radii = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
+    rows = np.flatnonzero(radii > 0)
+    records = records[rows]
+    return rows, records, _intersections(options, records, depths[rows], radii[rows])
 
 
 def most_painted(

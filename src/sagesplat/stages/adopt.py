@@ -23,6 +23,7 @@ from sagesplat.formats.levels import read_header, read_level, read_more, write_l
 from sagesplat.formats.splat import relative_to
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.io.typed import check_limits
+from sagesplat.raster import device_of, each_view
 from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash, is_done
 from sagesplat.run.run_dir import RunDir
@@ -45,6 +46,7 @@ from sagesplat.segment.masks import (
 from sagesplat.segment.parents import read_parents, write_parents
 from sagesplat.stages.edited import check_not_edited
 from sagesplat.stages.label import edit_of, make_masks
+from sagesplat.stages.memory import foretell_adopt
 from sagesplat.stages.scene import check_folder, open_scene, reading
 from sagesplat.train.votes import vote
 from sagesplat.viewer.frames import FLIP, upward
@@ -119,6 +121,7 @@ def _make_capture(
             job.emit(Warned(f"{source}: {count:,} Gaussians left out: {reason}"))
         splat = relative_to(splat, given[0].offset) if given else splat
         check_size(splat.gaussians, str(source))
+        foretell_adopt(job, len(splat.gaussians), config.steps if config.fit == "renders" else 0)
         if labelled:
             splat = _labelled(splat)
         left_out = "".join(f", {count:,} left out ({reason})" for reason, count in splat.dropped.items())
@@ -142,6 +145,7 @@ def _make_capture(
         contact_sheet(
             run.contact_sheet, g, cameras, up, [f"{source.name}: {len(g):,} Gaussians{left_out}", how],
             antialiased=splat.antialiased, backend=job.backend,
+            rendered=[] if photos else [view.image_path for view in views],
         )  # fmt: skip
         write_set(
             run.adopted, g, _LEVEL, exact=True, antialiased=splat.antialiased, offset=np.array(splat.offset)
@@ -221,17 +225,20 @@ def _write_pictures(
     paint = RenderedLabels(splat.gaussians, job.backend, splat.antialiased)
     paths = prepare_folder(masks, views) if labelled else []
     occurring: set[int] = set()
-    for done, view in enumerate(views):
-        if photos and not labelled:
-            break
+
+    def write(number: int) -> set[int]:
+        view = views[number]
+        rgb, ids = paint.picture(view.camera)
         if not photos:
-            rgb = paint.paint(view.camera)
             Image.fromarray((rgb * 255).round().astype(np.uint8)).save(view.image_path)
         if labelled:
-            ids = paint.render(view.camera)
-            write_mask(paths[done], ids, taxonomy)
-            occurring.update(np.unique(ids).tolist())
-        job.emit(Progress("adopt", done + 1, len(views)))
+            write_mask(paths[number], ids, taxonomy)
+        return set(np.unique(ids).tolist())
+
+    wanted = range(0 if photos and not labelled else len(views))
+    for done, of_view in enumerate(each_view(write, wanted, device_of(job.backend)), 1):
+        occurring |= of_view
+        job.emit(Progress("adopt", done, len(views)))
     if labelled and not occurring - {UNLABELLED}:
         raise DataError(
             f"{folder.name}: no viewpoint shows any of its labelled Gaussians; give --cameras of this "

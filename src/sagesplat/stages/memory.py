@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from sagesplat.core.errors import RunError
-from sagesplat.core.events import Warned
+from sagesplat.core.events import Noted, Warned
 from sagesplat.run.job import Job
 from sagesplat.segment.hf import DEFAULT_MODEL
 from sagesplat.segment.text import DEFAULT_DETECTOR, DEFAULT_MASK_MODEL
@@ -21,9 +21,24 @@ _DEFAULT_WEIGHTS = {  # bytes of the default networks', which may not be on this
     DEFAULT_DETECTOR: 689e6,
     DEFAULT_MASK_MODEL: 156e6,
 }
+_ADOPT = 1e9, 1500.0  # bytes of adopting a splat: whatever its size, and of each Gaussian
+_ADOPT_TIME = 90.0, 300e-6  # CPU seconds, the same; with --fit renders, each training step takes further
+_STEP_TIME = 0.25
 _ONNX = 50e6  # bytes that a small network computes with
 _TEXT = 0.6e9  # bytes that SAM 2 computes with; Grounding DINO takes more
 _HF = 12, 1.1e9  # the same of transformers' networks: times the weights, at most
+
+
+def foretell_adopt(job: Job, count: int, steps: int) -> None:
+    """Say how long adopting `count` Gaussians takes, about, with `steps` of training, and how much memory."""
+    needed = _ADOPT[0] + _ADOPT[1] * count
+    seconds = (_ADOPT_TIME[0] + _ADOPT_TIME[1] * count + _STEP_TIME * steps) / max(job.threads, 1)
+    needs = f"{count:,} Gaussians take about {max(round(seconds / 60), 1)} min and {needed / GIB:.1f} GiB"
+    limit = job.memory_limit or memory.default_limit()
+    if job.backend != "cuda" and needed > limit:
+        job.emit(Warned(f"{job.run.path}: {needs}; the limit is {limit / GIB:.1f} GiB"))
+    elif job.backend != "cuda":
+        job.emit(Noted(needs))
 
 
 def check_nest(job: Job, count: int, sh_degree: int) -> None:
