@@ -66,7 +66,7 @@ class Precision:
 AS_GIVEN = (
     Precision(position=1 / 8, opacity=3, log_scale=1 / 16, rotation=2.0),
     Precision(position=1 / 8, opacity=3, log_scale=1 / 16, rotation=2.0, sh_bits=(6, 6)),
-    Precision(  # fmt: skip
+    Precision(
         position=1 / 16, opacity=2, colour=1.0, log_scale=1 / 32, sh_bits=(7, 7), rotation=4.0, least=0.5
     ),
 )
