@@ -64,7 +64,7 @@ def measured(capture, **options) -> Evaluation:
     scene, ladder, photos = capture
     masks = RenderedLabels(ladder.whole, "cpu")
     return evaluate(
-        scene, photos, masks, ladder, PLANS, lambda kind, *_: float(QUALITIES.index(kind)),
+        scene, photos, masks, ladder, PLANS, lambda plan, *_: float(QUALITIES.index(plan.quality)),
         backend="cpu", uniform=[1, 3], **options,
     )  # fmt: skip
 

@@ -255,7 +255,7 @@ def test_what_spz_cannot_hold_is_said(tmp_path, lossless):
     open_splat(job, tmp_path / "a.ply", config, SceneConfig(), MasksConfig(), LabelsConfig())
     make_levels(job, config)
     said = [event.text for event in events if isinstance(event, Warned)]
-    assert any("--lossless keeps it as it came in" in text for text in said) != lossless
+    assert any("--lossless keeps the last level as it came in" in text for text in said) != lossless
 
 
 def test_positions_that_float32_has_rounded_are_said(tmp_path):

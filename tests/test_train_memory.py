@@ -26,7 +26,7 @@ def test_the_prediction_grows_with_what_is_asked_for(scene: Scene) -> None:
     assert 1.9e9 < needed(many) < 2.6e9
     assert needed(replace(many, sh_degree=0)) < 0.5 * needed(many)
     assert needed(many, processes=3) == pytest.approx(3 * needed(many), abs=3)
-    assert needed(TrainConfig(max_gaussians=10**9)) == needed(TrainConfig())  # as photos set a cap
+    assert needed(TrainConfig(max_gaussians=10**6)) > needed(TrainConfig())  # the photos set that cap
     fitted = memory.fit(scene, many, 64 * memory.GIB)
     assert fitted.config == many
     assert str(fitted) == "needs about 2.2 GiB at the densification cap of 1,000,000 Gaussians, of 64.0"

@@ -17,6 +17,7 @@ from sagesplat.adapt.observe import render_rgb
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.io.files import atomic_path
+from sagesplat.io.pictures import open_picture
 from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, shortened
 from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.scene import Camera
@@ -79,7 +80,7 @@ def contact_sheet(
 
 
 def _smaller(path: Path) -> Float32[np.ndarray, "H W 3"]:
-    with Image.open(path) as image:
+    with open_picture(path) as image:
         image.thumbnail((_SIDE, _SIDE), Image.Resampling.BOX)
         return np.asarray(image.convert("RGB"), np.float32) / 255
 

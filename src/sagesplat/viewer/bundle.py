@@ -115,7 +115,9 @@ def verified_files(contents: Contents) -> Iterator[tuple[str, bytes]]:
 
     DataError where one is missing or not what the index says: the increments in it, one after the other.
     """
-    for uri, some in groupby(contents.chunks, key=lambda chunk: chunk.uri):
+    # streams of a category's cells take turns in its file where some replace what is below
+    chunks = sorted(contents.chunks, key=lambda chunk: (chunk.uri, chunk.offset))
+    for uri, some in groupby(chunks, key=lambda chunk: chunk.uri):
         path, at = contents.folder / uri, 0
         try:
             content = path.read_bytes()
