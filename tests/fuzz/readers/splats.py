@@ -95,7 +95,7 @@ def _ranges(folder: Path) -> list[dict[str, Any]]:
 
 def _read_index(path: Path) -> None:
     chunks = read_index(path.parent)
-    totals(chunks, [2, 5], 4, "nbytes")
+    totals(chunks, [2, 5], 5, "nbytes")
     if len(chunks) < 10:  # what many chunks hold is not bounded by their index
         read_increments(path.parent, chunks)
         if {chunk.format for chunk in chunks} == {"stream"}:
