@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ from conftest import pinhole, random_gaussians
 from sagesplat.adapt.cells import describe_cells
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.formats.increments import write_increments
+from sagesplat.formats.stream_header import AS_GIVEN
+from sagesplat.formats.stream_increments import write_streams
 from sagesplat.viewer import single_file
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents
 from sagesplat.viewer.single_file import write_single_file
@@ -131,3 +134,26 @@ def test_what_browsers_do_not_open_is_refused(tmp_path, viewer, contents, monkey
     ):
         write_single_file(tmp_path / "a.html", contents, viewer)
     assert not (tmp_path / "a.html").exists()
+
+
+def test_streams_of_cells_that_take_turns_in_a_file_are_checked_and_written(tmp_path, viewer) -> None:
+    """The lowest sets of all cells of a category come first in its file, then what replaces them."""
+    g = random_gaussians(60, degree=1)
+    cells = torch.arange(60, dtype=torch.int16) // 30
+    g = replace(g, label_ids=cells, logit_opacities=torch.full((60,), 1.0))
+    sizes, label_of = {0: (4, 30), 1: (4, 30)}, {0: 7, 1: 7}
+    made = write_streams(
+        tmp_path / "chunks", g, sizes, {7: "tree"}, label_of=label_of, replaces={0: (2,), 1: (2,)},
+        last=AS_GIVEN[0],
+    )  # fmt: skip
+    assert len({one.uri for one in made.increments}) == 1
+    cameras = [CameraEntry("a.jpg", "train", pinhole())]
+    contents = Contents(
+        "tiny", 1.0, cameras, [Category(7, "tree", "tree", "#808080")], describe_cells(g, label_of),
+        made.increments, tmp_path / "chunks", 1,
+    )  # fmt: skip
+    write_single_file(tmp_path / "a.html", contents, viewer)
+    inside = re.findall(r'data-uri="chunks/([^"]+)">([^<]*)<', (tmp_path / "a.html").read_text())
+    assert [base64.b64decode(text) for _, text in inside] == [
+        (tmp_path / "chunks" / made.increments[0].uri).read_bytes()
+    ]
