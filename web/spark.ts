@@ -7,8 +7,8 @@ const WORKER = /const jsContent = ('(?:[^'\\]|\\.)*');/;
 const MANY = 300_000; // splats from which its WebAssembly is worth loading for sorting alone
 
 /**
- * Spark without its WebAssembly in the first picture's way. As published it is a third of a bundle's first
- * bytes, as base64 in the script, and is waited for. Here it is a file, asked for where splats are to be decoded
+ * Spark without its WebAssembly in the first picture's way. As published it is three quarters of
+ * the viewer's code, as base64 in the script, and is waited for. Here it is a file, asked for where splats are to be decoded
  * from SPZ or PLY, or many of them sorted; till then splats are sorted by `backToFront`.
  *
  * @param isInline - keeps it in the script, for those who want one file

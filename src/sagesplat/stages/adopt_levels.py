@@ -216,7 +216,7 @@ def _write(
     return [
         f"{levels} levels, {num_lower} of them of merged Gaussians; "
         f"{size / 1e6:.2f} MB in {files} file{'s' if files > 1 else ''}",
-        f"{len(sent):,} Gaussians, {len(before):,} of them at the last level: {loss}",
+        f"{len(sent):,} Gaussians, {len(top):,} of them at the last level: {loss}",
     ]
 
 
