@@ -66,16 +66,27 @@ def test_cells_that_no_viewpoint_shows_stay_at_the_level_of_the_category() -> No
     assert plan.cells[4] == equal.levels[3]
 
 
+def test_a_category_that_is_asked_for_more_goes_up() -> None:
+    """Also one of a single cell, whose level is then the cheapest that keeps what is asked."""
+    measured, pixels = _measured(0)
+    of_label = np.stack([_whole(measured, pixels, np.full(5, k)) for k in range(LEVELS)], 1)
+    both = np.stack([of_label, measured[:, 5]], 1)
+    equal = plan_for_scene(both, np.zeros((VIEWS, 2)), _costs().by_label(LABEL_OF), 0.3, 0.95, "fidelity")
+    asked = plan_for_scene(both, np.zeros((VIEWS, 2)), _costs().by_label(LABEL_OF), 0.7, 0.95, "fidelity")
+    plan = thinned(equal, measured, pixels, _costs(), LABEL_OF, {3: 2.0, 7: 0.7})
+    assert equal.levels[7] < plan.levels[7] == asked.levels[7]
+    assert plan.levels[3] == LEVELS  # nothing keeps that, and its last level comes nearest
+
+
 def test_what_cannot_be_asked_for_stays() -> None:
-    """A target above all that is measured, and too few viewpoints for the share."""
+    """Of too few viewpoints for the share."""
     measured, pixels = _measured(1)
     of_label = np.stack([_whole(measured, pixels, np.full(5, k)) for k in range(LEVELS)], 1)
     both = np.stack([of_label, measured[:, 5]], 1)
     equal = plan_for_scene(both, np.zeros((VIEWS, 2)), _costs().by_label(LABEL_OF), 0.8, 0.95, "fidelity")
-    for views, asked in ((VIEWS, 1.01), (18, 0.8)):
-        plan = thinned(equal, measured[:views], pixels[:views], _costs(), LABEL_OF, {3: asked})
-        assert plan.choices == equal.choices
-        assert plan.cells == {cell: equal.levels[label] for cell, label in LABEL_OF.items()}
+    plan = thinned(equal, measured[:18], pixels[:18], _costs(), LABEL_OF, {3: 0.9})
+    assert plan.choices == equal.choices
+    assert plan.cells == equal.levels_of_cells(LABEL_OF)
 
 
 def test_what_a_composition_misses_is_said() -> None:

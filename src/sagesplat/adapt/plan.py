@@ -82,6 +82,11 @@ class Plan:
         """Level by label id."""
         return {choice.label_id: choice.level for choice in self.choices}
 
+    def levels_of_cells(self, label_of: Mapping[int, int]) -> dict[int, int]:
+        """Level by cell id, of all cells; `label_of`: label id by cell id."""
+        levels = self.levels
+        return self.cells or {cell: levels[label] for cell, label in label_of.items()}
+
     def compose(self, ladder: Ladder) -> Gaussians:
         """The Gaussians of the ladder that it chose."""
         if self.cells is None:

@@ -40,7 +40,8 @@ def thinned(
         asked: Fidelity by label id, of the categories to change; at least the plan's target.
 
     Returns:
-        The plan with `Plan.cells`. A category stays at its level where its cells would not take less.
+        The plan with `Plan.cells`. The cells of a category stay at one level, the plan's or the cheapest
+        above it that keeps what is asked, where levels of their own would not take less.
     """
     assert plan.share is not None
     labels = np.array([label_of[cell] for cell in costs.labels])
@@ -51,10 +52,14 @@ def thinned(
         weight = pixels[:, mine]
         views = weight.sum(1) > 0
         rank = math.ceil((views.sum() + 1) * plan.share - 1e-9)
-        if len(mine) == 1 or rank > views.sum():
+        if rank > views.sum():
             continue
         share = weight[views] / weight[views].sum(1, keepdims=True)
         value = share[..., None] * np.nan_to_num(measured[views][:, mine].astype(np.float64))
+        value = np.maximum.accumulate(value, 2)
+        keeps = (value.sum(1) >= target).sum(0) >= rank
+        keeps[-1] = True  # there is nothing above
+        levels[mine] = np.maximum(levels[mine], keeps.argmax())
         found = _cover(value, nbytes[mine], target, int(rank), levels[mine])
         if found is not None and _total(nbytes[mine], found) < _total(nbytes[mine], levels[mine]):
             levels[mine] = found
@@ -72,7 +77,6 @@ def _cover(
 
     `value`: what each cell adds to the fidelity of each view. A cell that no view shows is at `equal`.
     """
-    value = np.maximum.accumulate(value, 2)
     cells, columns = np.arange(len(cost)), np.arange(cost.shape[1])
     levels = np.where(value[..., -1].any(0), 0, equal)
     while True:

@@ -47,7 +47,7 @@ from sagesplat.stages.shared import distances_from, label_named, observed
 from sagesplat.stages.snapshots import Snapshots
 from sagesplat.stages.viewpoints import fit_viewpoints
 
-_RAISES = 4  # times that a plan is measured in its composition, and its failing levels raised
+_RAISES = 6  # times that a plan is measured in its composition, and its failing levels raised
 
 
 class NestedLevels(Method):
@@ -213,7 +213,7 @@ class NestedLevels(Method):
         """See `Method`: those for fidelity are measured at drawn viewpoints, and raised."""
         plans = [self.plan_scene(target, share, quality) for quality, target in targets]
         drawn, mean_and_pixels = viewpoints_of(self.job), pooled(*self.sampled)
-        cameras = [drawn.cameras[row] for row in drawn.rows("bias")]
+        cameras = [drawn.cameras[row] for row in drawn.rows("bias", "calibration")]
         fewer = self._thinned(plans, share, cameras)
         plans = [fewer.get(i, plan) for i, plan in enumerate(plans)]
         open_ones = [i for i, plan in enumerate(plans) if plan.quality == "fidelity" and i not in fewer]
@@ -232,45 +232,47 @@ class NestedLevels(Method):
     def _thinned(self, plans: Sequence[Plan], share: float, cameras: Sequence[Camera]) -> dict[int, Plan]:
         """Plans for fidelity by cell, by their place: those that hold in their compositions at `cameras`.
 
-        A category that misses its target there is asked for more, by what it misses.
+        A category that misses its target there is asked for more, by what it misses. Where that changes
+        nothing its neighbours spill over it, and they are asked for more, by half of what it misses.
         """
-        job, found = self.job, dict[int, Plan]()
+        job, found, label_of = self.job, dict[int, Plan](), self.job.cells.label_of
         if len(self.cell_costs.labels) == len(self.costs.labels) or len(cameras) < fewest_views(share):
             return found
         sampled = sampled_of(job)
-        shown = sampled.by_label(job.cells.label_of).shown()
+        shown = sampled.by_label(label_of).shown()
         pixels = sampled.pixels * shown[:, np.unique(job.cells.labels, return_inverse=True)[1]]
         reaching = {
             i: {c.label_id: plan.target for c in plan.choices if c.status == "ok"}
             for i, plan in enumerate(plans)
             if plan.quality == "fidelity" and share < 1
         }
+        before = dict[int, dict[int, int]]()
         for _ in range(_RAISES):
             tried = {
-                i: thinned(
-                    plans[i], sampled.fidelity, pixels, self.cell_costs, job.cells.label_of, asked
-                )
+                i: thinned(plans[i], sampled.fidelity, pixels, self.cell_costs, label_of, asked)
                 for i, asked in reaching.items()
-            }  # fmt: skip
+            }
             if not tried:
                 break
             measured = self._in_composition(list(tried.values()), cameras)
             for j, (i, plan) in enumerate(tried.items()):
                 plan, missed = measured_in_composition(plan, measured[:, j], proven=False)
-                for label, by in missed.items():
-                    reaching[i][label] += by
                 if not missed:
                     found[i] = plan
                     del reaching[i]
+                    continue
+                levels = plan.levels_of_cells(label_of)
+                changed = {label_of[cell] for cell in label_of if levels[cell] != before.get(i, {}).get(cell)}
+                before[i] = levels
+                spilt = max((by for label, by in missed.items() if label not in changed), default=0.0)
+                for label in reaching[i]:
+                    reaching[i][label] += missed.get(label, spilt / 2)
         return found
 
     def _in_composition(self, plans: Sequence[Plan], cameras: Sequence[Camera]) -> np.ndarray:
         """Fidelity of each category in each plan's composition, [V, J, L]; NaN where it shows too little."""
         label_of = self.job.cells.label_of
-        levels = np.array([
-            [plan.cells[cell] if plan.cells else plan.levels[label] for cell, label in label_of.items()]
-            for plan in plans
-        ])  # fmt: skip
+        levels = np.array([list(plan.levels_of_cells(label_of).values()) for plan in plans])
         planned = np.broadcast_to(levels, (len(cameras), *levels.shape))
         fidelity, pixels = compositions_at(self.job, cameras, planned, "plan")
         shown = shown_enough(pixels, cameras)

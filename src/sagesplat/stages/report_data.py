@@ -207,7 +207,7 @@ def _promise(
         for column, label in enumerate(sampled.labels)
         if shown[:, column].any()
     }
-    of_cells = plan.cells or {cell: plan.levels[label] for cell, label in cells.label_of.items()}
+    of_cells = plan.levels_of_cells(cells.label_of)
     columns = np.array([of_cells[cell] for cell in by_cell.labels]) - 1
     taken = by_cell.fidelity[:, np.arange(len(columns)), columns]
     member = cells.labels[:, None] == np.array(sampled.labels)
