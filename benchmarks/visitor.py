@@ -49,7 +49,7 @@ SECONDS = 60
 _STEPS = 2  # poses a second: software draws no more
 _WALKS = 8  # places that a walk goes through
 # the next pose; then what is drawn and promised once the page has drawn it
-_SAMPLE = """async (pose) => {
+SAMPLE = """async (pose) => {
   const view = window.sagesplat
   view.setPose(pose)
   for (let i = 0; i < 2; i++) await new Promise(requestAnimationFrame)
@@ -57,8 +57,10 @@ _SAMPLE = """async (pose) => {
   const { labels, screens } = view.state()
   return {
     pose: view.pose(), width, height, most: screens?.most ?? null,
-    labels: labels.map(({ label, shown, promised, visible }) =>
-      ({ id: label.id, shown, visible, promised: Number.isFinite(promised) ? promised : null })),
+    labels: labels.map(({ label, shown, promised, visible, cells }) => ({
+      id: label.id, shown, visible, promised: Number.isFinite(promised) ? promised : null,
+      cells: cells.map(({ cell, shown, visible }) => [cell.id, shown, visible]),
+    })),
   }
 }"""
 
@@ -114,18 +116,22 @@ def sampled(url: str, cameras: Sequence[Camera], screen: Screen, every: int) -> 
         opened.wait_for("Boolean(window.sagesplat)")
         opened.page.evaluate("window.sagesplat.ready")
         for number, camera in enumerate(cameras):
-            pose = {
-                "position": frames.position(camera).tolist(),
-                "quaternion": frames.quaternion(camera).tolist(),
-            }
+            pose = pose_of(camera)
             if number % every == 0:
-                found.append(opened.page.evaluate(_SAMPLE, pose))
+                found.append(opened.page.evaluate(SAMPLE, pose))
             else:
                 opened.page.evaluate("(pose) => window.sagesplat.setPose(pose)", pose)
                 opened.page.wait_for_timeout(1000 / _STEPS)
         if opened.complaints:
             raise SystemExit(f"the page complains: {opened.complaints[:3]}")
     return found
+
+
+def pose_of(camera: Camera) -> dict[str, list[float]]:
+    """A camera's pose as the page takes it."""
+    return {
+        "position": frames.position(camera).tolist(), "quaternion": frames.quaternion(camera).tolist()
+    }  # fmt: skip
 
 
 def camera_of(sample: dict[str, Any], like: Camera) -> Camera:
@@ -151,9 +157,9 @@ def checked(job: Job, samples: Sequence[dict[str, Any]]) -> list[dict[str, Any]]
         share = min(drawn.rule.screens[1] / screen, 1)
         smaller = camera.resized(*(max(round(share * side), 1) for side in (camera.width, camera.height)))
         at = references.at(smaller)
-        levels = {one["id"]: one["shown"] for one in sample["labels"] if one["shown"]}
-        full = dict.fromkeys(references.labels, job.ladder.levels[-1])
-        shown, whole = (_picture(job, camera, one, smaller) for one in (levels, full))
+        levels = levels_of(sample)
+        full = dict.fromkeys(job.by_cell.sizes, job.ladder.levels[-1])
+        shown, whole = (picture(job, camera, one, smaller) for one in (levels, full))
         means = means_by_label(ssim_map(shown, whole), at.label_ids)
         for one in sample["labels"]:
             pixels = means.get(one["id"], (0, 0))[1]
@@ -166,15 +172,20 @@ def checked(job: Job, samples: Sequence[dict[str, Any]]) -> list[dict[str, Any]]
                     "screen": screen,
                     "promised": one["promised"],
                     "measured": float(means[one["id"]][0]),
-                    "level": one["shown"],
+                    "share": one["shown"],
                 }
             )
     return rows
 
 
-def _picture(job: Job, camera: Camera, levels: dict[int, int], smaller: Camera) -> np.ndarray:
-    """The levels in a camera's pixels, averaged down to those of a smaller one."""
-    image = render_rgb(job.ladder.compose(levels), camera, backend=job.backend, antialiased=job.antialiased)
+def levels_of(sample: dict[str, Any]) -> dict[int, int]:
+    """The levels that a sample draws, by cell id."""
+    return {cell: level for one in sample["labels"] for cell, level, _ in one["cells"] if level}
+
+
+def picture(job: Job, camera: Camera, levels: dict[int, int], smaller: Camera) -> np.ndarray:
+    """The cells' levels in a camera's pixels, averaged down to those of a smaller one."""
+    image = render_rgb(job.by_cell.compose(levels), camera, backend=job.backend, antialiased=job.antialiased)
     if camera.width == smaller.width:
         return image
     pixels = torch.from_numpy(image).permute(2, 0, 1)[None]
