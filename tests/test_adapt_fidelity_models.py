@@ -183,9 +183,9 @@ def test_shares_are_those_that_were_seen():
 
 def test_no_promise_far_from_all_that_was_sampled():
     models, _ = made(0)
-    far, turned = np.eye(4, dtype=np.float32), np.diag([-1, 1, -1, 1]).astype(np.float32)
+    far = np.eye(4, dtype=np.float32)
     far[0, 3] = -30
-    cameras = [replace(viewpoints(1, 0)[0], w2c=w2c) for w2c in (far, turned)]
+    cameras = [replace(viewpoints(1, 0)[0], w2c=far)]
     assert np.isnan(needed(models, expect(models, CELLS, cameras, K), 0.8)).all()
 
 

@@ -50,6 +50,10 @@ MOST_PHOTOS = 256  # by which it is known how far a place is from the photos
 CELL_SHARE = 5e-4  # of a picture that a cell has to cover where its model learns
 _TOWARDS = 4.0  # views that a category's mean counts as, beside those of a cell
 _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more than chance
+# Of the least support of the viewpoints drawn, below which nothing is promised. One more from the same
+# distribution is often a little sparser where they lie far apart: on the built-in capture 8 % of decisions of
+# those walking and 14 % of those stepping back had no promise with 1, 2 % and 6 % have none with this.
+_SPARSER = 0.7
 
 
 def fit_fidelity(
@@ -171,7 +175,7 @@ def _fit(
         rmse=float(np.sqrt(((without - category) ** 2).mean(0)).mean()),
         calibration=_calibration(
             TARGETS + AT_A_PHOTO * margins, margins, "uncalibrated", confidence, 0,
-            float(near[rows].max(1).min()),
+            _SPARSER * float(near[rows].max(1).min()),
         ),
     )  # fmt: skip
 
@@ -265,8 +269,8 @@ class Trial:
         return (got < NOMINAL).sum(0)
 
     def least_support(self, label: int) -> float:
-        """The least support of any of these viewpoints: further away nothing was tried."""
-        return float(self.support[self.views(label), list(self.labels).index(label)].min())
+        """The support from which on something is promised, after these viewpoints."""
+        return _SPARSER * float(self.support[self.views(label), list(self.labels).index(label)].min())
 
 
 def remove_composition_bias(
