@@ -11,7 +11,7 @@ import torch
 from conftest import random_gaussians, write_capture
 
 from benchmarks.gpu import __main__ as script
-from benchmarks.gpu import agreement, base, gsplat_trainer, runs, split
+from benchmarks.gpu import agreement, base, gsplat_trainer, split
 from sagesplat.core.config import TrainConfig
 from sagesplat.demo.capture import make_capture
 from sagesplat.metrics.image import photometric_loss, ssim_map
@@ -43,13 +43,10 @@ def test_a_trial_of_the_whole_script(tmp_path, capsys):
     figures = tried(tmp_path)
     table = capsys.readouterr().out.splitlines()[-len(script.CHECKS) :]
     assert [line.split()[:2] for line in table] == [
-        ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["freeze", "ok"], ["split", "ok"],
-        ["multi", "skipped"],
+        ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["split", "ok"], ["multi", "skipped"],
     ]  # fmt: skip
     race = figures["race"]["figures"]
-    assert set(race["runs"]) == {"ours", "third", "two_thirds", "all"}
-    assert set(race["missed"]) == {"gsplat"}
-    assert race["runs"]["third"]["settings"]["skipped"] > 0
+    assert (set(race["runs"]), set(race["missed"])) == ({"ours"}, {"gsplat", "mcmc", "large"})
     assert set(figures["split"]["figures"]["kernels"]) == {*(name for name, _ in split.KERNELS), "rest"}
 
 
@@ -65,15 +62,6 @@ def test_a_machine_without_a_gpu_says_so_in_one_line(capsys):
     assert out == ""
     (line,) = err.splitlines()
     assert "; " in line or " or use --device cpu" in line
-
-
-def test_targets_are_what_so_many_labels_have_reached():
-    reached = {1: 0.9019, 2: 0.8, 3: 0.7, 4: 0.6, 5: 0.5, 6: 0.4007}
-    found = runs.targets(reached)
-    assert found == {"third": 0.8, "two_thirds": 0.6, "all": 0.4}
-    for name, share in (("third", 2), ("two_thirds", 4), ("all", 6)):
-        assert sum(ssim >= found[name] for ssim in reached.values()) == share
-    assert runs.targets({1: 0.75}) == {"third": 0.75, "two_thirds": 0.75, "all": 0.75}
 
 
 # --- gsplat's recipe -------------------------------------------------------------------------------------

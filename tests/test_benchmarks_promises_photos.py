@@ -24,7 +24,6 @@ def test_redraws_of_a_known_field():
         (d.accepted & (d.target == 0.5) & (d.predictor == "bound")).sum() for d in draws
     )
     assert row["coverage_p5"] <= row["coverage"] <= 1
-    assert row["covered"] == (row["coverage"] >= 0.95 and row["coverage_p5"] >= 0.88)
 
 
 def test_a_split_keeps_the_training_views():

@@ -340,9 +340,8 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(tmp_path: Path, kind: 
     assert damage.startswith(f"{path}: ")
     assert torch.equal(state.gaussians.means, state_at(20).gaussians.means)
     damaged(previous(path), kind)
-    with pytest.raises(RunError, match=r"checkpoint\.npz: .*, and .*checkpoint-1\.npz: .*; delete both") as e:
+    with pytest.raises(RunError, match=r"checkpoint\.npz: .*, and .*checkpoint-1\.npz: .*; delete both"):
         latest_checkpoint(path, "s")
-    assert "\n" not in str(e.value)
     remove_checkpoints(path)
     assert list(tmp_path.iterdir()) == []
 
@@ -431,9 +430,8 @@ def test_training_does_not_go_on_with_a_damaged_level(scene: Scene, trained: Pat
     level = tmp_path / "levels" / "000008.npz"
     damaged(level, "bit")
     message = r"000008\.npz: a damaged level .*; delete it to resume without that level, or .*checkpoint\.npz"
-    with pytest.raises(RunError, match=message) as caught:
+    with pytest.raises(RunError, match=message):
         list(training(scene, tmp_path))
-    assert "\n" not in str(caught.value)
     (tmp_path / "checkpoint.npz").unlink()
     list(training(scene, tmp_path))
     assert content(tmp_path) == content(trained)

@@ -276,9 +276,8 @@ def test_documents_that_do_not_belong_to_the_others(
     assert old in text
     (run / name).write_text(text.replace(old, new))
     agree(run)
-    with pytest.raises(SageError, match=complaint) as caught:
+    with pytest.raises(SageError, match=complaint):
         COMMAND[command](run)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

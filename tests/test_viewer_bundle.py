@@ -569,8 +569,7 @@ def test_a_damaged_chunk_is_named_and_the_old_bundle_stays(tmp_path, contents, v
     path.unlink()
     if not missing:
         path.write_bytes(before[:-1] + b"x")
-    with pytest.raises(DataError, match=rf"{contents.chunks[1].uri}: .*sagesplat nest") as caught:
+    with pytest.raises(DataError, match=rf"{contents.chunks[1].uri}: .*sagesplat nest"):
         write_bundle(tmp_path / "out", contents, viewer)
-    assert "\n" not in str(caught.value)
     assert manifest_of(tmp_path / "out")["totals"]["count"] == 39
     assert not list(tmp_path.glob(".out*"))

@@ -22,7 +22,7 @@ import tyro
 from benchmarks.common import GARDEN, RESULTS, ROOT, rounded
 from benchmarks.gpu.agreement import agreement
 from benchmarks.gpu.base import Asked, Bench, Outcome, one_line, wait
-from benchmarks.gpu.runs import freeze, full, multi, race
+from benchmarks.gpu.runs import full, multi, race
 from benchmarks.gpu.split import split
 from sagesplat.core.errors import BackendUnavailable, SageError
 from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
@@ -33,7 +33,7 @@ from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Masks, Taxonomy
 
 CHECKS: dict[str, Callable[[Bench], Outcome]] = {
-    "agreement": agreement, "full": full, "race": race, "freeze": freeze, "split": split, "multi": multi,
+    "agreement": agreement, "full": full, "race": race, "split": split, "multi": multi,
 }  # fmt: skip
 
 
@@ -52,8 +52,8 @@ def main(
 ) -> None:
     """All checks that a machine with a GPU owes, in so many minutes; `--device cpu` tries the script.
 
-    `runs`: the trainings of `race` and `freeze`, of ours, gsplat, mcmc (gsplat's, as many Gaussians as
-    ours), large (ours, four millions), third, two_thirds, all; none: all of them.
+    `runs`: the trainings of `race`, of ours, gsplat, mcmc (gsplat's, as many Gaussians as ours), large
+    (ours, four millions); none: all of them.
     """
     asked = Asked(scene, downscale, steps, minutes, device, only, runs, masks, lpips, out, write)
     raise SystemExit(check(asked))

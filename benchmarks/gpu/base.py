@@ -88,7 +88,7 @@ class Bench:
     labels: np.ndarray  # int16 [P], category of each point
     steps: int = 0  # of each long run, once it is known
     runs: dict[str, Any] = field(default_factory=dict)  # trainings (or the errors they ended with) by name
-    trained: Gaussians | None = None  # by the run without freeze, on the CPU
+    trained: Gaussians | None = None  # on the CPU
 
     @cached_property
     def device(self) -> torch.device:
