@@ -17,7 +17,6 @@ from sagesplat.cli.console import Console
 from sagesplat.core.config import FitConfig, PlanConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped, Training, Warned
-from sagesplat.demo.capture import make_capture
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json
 from sagesplat.run.job import Job
@@ -33,13 +32,6 @@ SETTINGS = "--train.max-steps 60 --train.level-every 30 --ladder snapshots --tar
 
 class Killed(Exception):
     """What a test kills a stage with."""
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=12, width=64, height=48)
-    return folder
 
 
 @pytest.fixture(scope="module")

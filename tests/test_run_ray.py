@@ -103,13 +103,6 @@ def test_an_error_of_the_user_is_its_line_and_ends_the_others(executor: RayExecu
 
 
 @pytest.mark.slow
-def test_a_fault_of_ours_keeps_its_traceback(executor: RayExecutor) -> None:
-    with pytest.raises(ZeroDivisionError) as raised:
-        results(executor, [Task("divide", divide, (0,))], lambda event: None)
-    assert "return 1 / number" in str(raised.value.__cause__)
-
-
-@pytest.mark.slow
 def test_a_task_on_a_gpu_takes_its_share_of_the_cpus(cluster: Any, tmp_path: Path, monkeypatch) -> None:
     nodes = [{"CPU": 16.0, "GPU": 4.0, "memory": 64e9}, {"CPU": 8.0, "memory": 8e9}]
     monkeypatch.setattr(RayExecutor, "_nodes", lambda self: nodes)

@@ -1,6 +1,5 @@
 """The simulated CDN against references and closed forms; conservation; recorded visits."""
 
-import json
 from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,6 @@ from benchmarks.scaling import __main__ as report
 from benchmarks.scaling import figures, theory
 from benchmarks.scaling.cdn import DAY, HIT, MISS, VALIDATED, Outcome, Site, new_caches, serve, simulate
 from benchmarks.scaling.visits import KINDS, Library, read
-from sagesplat.core.errors import DataError
 
 VISITS = Path(__file__).parent / "data" / "scaling_visits.json"
 SITE = Site(viewers=3000, scenes=40, pops=4, pop_bytes=1.5e6, shield_bytes=4e6, mix=(0.4, 0.6), returning=0.3)
@@ -35,9 +33,8 @@ def requests(files: np.ndarray, sizes: np.ndarray, capacity: float, **timing: fl
     tables, origin, minutes = np.zeros((2, 2, 4), int), np.zeros(2, int), np.zeros((3, 1441), int)
     values = np.array([timing.get("begin", 0.0), timing.get("fill", 0.0), timing.get("ttl", 0.0)])
     n, hashed = len(files), np.full(len(files), not timing.get("unhashed"))
-    coalesce = bool(timing.get("coalesce", 1))
     at, pop = np.arange(n) * 1.0, np.zeros(n, int)
-    serve(at, pop, files, hashed, sizes[files], sizes, caches, values, coalesce, tables, origin, minutes)
+    serve(at, pop, files, hashed, sizes[files], sizes, caches, values, tables, origin, minutes)
     assert caches.used[0] <= capacity
     return tables[0, 0]
 
@@ -70,12 +67,6 @@ def test_hit_rates_are_those_of_ches_approximation(share: float):
     found = requests(rng.choice(n, count, p=rates), sizes, capacity, begin=count / 2)
     time = theory.characteristic_time(rates, sizes, capacity)
     assert found[HIT] / found.sum() == pytest.approx((rates * -np.expm1(-rates * time)).sum(), abs=0.005)
-
-
-def test_files_without_a_hash_are_asked_for_again():
-    files, sizes = np.zeros(10, int), np.array([5])
-    assert requests(files, sizes, 9.0, unhashed=1).tolist() == [0, 0, 9, 1]
-    assert requests(files, sizes, 9.0, unhashed=1, ttl=3.0).tolist() == [7, 0, 2, 1]
 
 
 def test_no_byte_and_no_request_is_lost(day: Outcome):
@@ -120,22 +111,6 @@ def test_recorded_visits_are_read(library: Library):
     assert library.kept[0, :5].tolist() == [True] * 5
     assert library.kept[2, :5].tolist() == [True, True, True, True, False]
     assert library.hashed[0].tolist() == [False, True, True, False, *[True] * 7]
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"format": "else"}, "no recorded visits"),
-        ({"profiles": [{"visits": [{"requests": [[-1, 0]]}]}]}, "damaged"),
-        ({"files": [{"uri": "index.html"}] * 11}, "damaged"),
-    ],
-)
-def test_damaged_recordings_are_refused_in_one_line(tmp_path: Path, change: dict[str, object], said: str):
-    path = tmp_path / "visits.json"
-    path.write_text(json.dumps(json.loads(VISITS.read_text()) | change))
-    with pytest.raises(DataError, match=said) as error:
-        read([path])
-    assert str(path) in str(error.value)
 
 
 def test_days_and_figures(library: Library, capsys: pytest.CaptureFixture[str]):

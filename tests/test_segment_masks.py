@@ -355,11 +355,3 @@ def test_names_that_may_not_be_are_refused_where_they_are_read(tmp_path, name, w
     assert said.startswith(f"{tmp_path / 'labels.json'}: label 3 is named ")
     assert said.isprintable()
     assert len(said) < 600
-
-
-def test_an_accent_in_two_ways_is_one_name(tmp_path):
-    save(tmp_path / "a.png", IDS, {"labels": {"3": "caf\u00e9", "184": "cafe\u0301"}})
-    with pytest.raises(LabelError, match="name of its own"):
-        imported(scene_of("a.jpg"), tmp_path)
-    save(tmp_path / "a.png", IDS, {"labels": {"3": "cafe\u0301", "184": "Tree"}})
-    assert imported(scene_of("a.jpg"), tmp_path)[0].taxonomy.names == {3: "caf\u00e9", 184: "Tree"}

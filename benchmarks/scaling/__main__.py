@@ -66,7 +66,6 @@ def run(visits: Path, out: Path, viewers: Sequence[int], seed: int) -> dict[str,
     result["visits"] = {name: means(library) for name, library in named.items()}
     result["days"] = days(small, base, viewers)
     result["caches"] = {"as recorded": sweep(small, middle), "ten times the bytes": sweep(large, middle)}
-    result["variants"] = variants(small, files, middle)
     write_json(out / "scaling.json", result)
     with (out / "scaling-days.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(result["days"][0]))
@@ -116,26 +115,6 @@ def sweep(library: Library, site: Site) -> list[dict[str, Any]]:
         row["che"], row["che_bytes"] = pop_hits(library, here)
         rows.append(row)
         tell(f"cache of {size / 1e9:g} GB", row)
-    return rows
-
-
-def variants(library: Library, files: Library, site: Site) -> dict[str, dict[str, Any]]:
-    """A day with one thing changed at a time; `files`: the same bundles without their packs."""
-    changes: dict[str, dict[str, Any]] = {
-        "as served": {},
-        "60 s fresh at the edge": {"edge_ttl": 60.0},
-        "no shield": {"shield_bytes": 0.0},
-        "no coalescing": {"coalesce": False},
-        "one page for all scenes": {"shared_viewer": True},
-        "50 % return": {"returning": 0.5},
-        "10,000 scenes": {"scenes": 10_000, "pops": 10},
-        "1000 scenes, 10 points of presence": {"pops": 10},
-        "one scene, empty caches": {"scenes": 1, "warm_days": 0.0},
-    }
-    rows = {name: simulate(library, replace(site, **change)).row() for name, change in changes.items()}
-    rows["no packs"] = simulate(files, site).row()
-    for name, row in rows.items():
-        tell(name, row)
     return rows
 
 

@@ -56,14 +56,14 @@ def _to_front(caches, c, file):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def ask(caches: Caches, c, file, hashed, now, sizes, fill, ttl, coalesce):  # type: ignore[no-untyped-def]
+def ask(caches: Caches, c, file, hashed, now, sizes, fill, ttl):  # type: ignore[no-untyped-def]
     """One request to cache `c`: HIT, SHARED, VALIDATED (held, asked for again) or MISS; keeps the file."""
     if caches.after[c, file] >= 0:
         _unlink(caches, c, file)
         _to_front(caches, c, file)
         age = now - caches.checked[c, file]
         if 0 <= age < fill:
-            return SHARED if coalesce else MISS
+            return SHARED
         if hashed or age <= ttl:
             return HIT
         caches.checked[c, file] = now
@@ -83,7 +83,7 @@ def ask(caches: Caches, c, file, hashed, now, sizes, fill, ttl, coalesce):  # ty
 
 @njit(cache=True)
 def serve(  # type: ignore[no-untyped-def]
-    at, pop, files, hashed, body, sizes, caches, timing, coalesce, tables, origin, minutes
+    at, pop, files, hashed, body, sizes, caches, timing, tables, origin, minutes
 ):
     """Requests in the order of time through a point of presence and the shield to the origin.
 
@@ -100,7 +100,7 @@ def serve(  # type: ignore[no-untyped-def]
         file, now = files[i], at[i]
         counts = now >= begin
         minute = min(int((now - begin) / 60), 1440) if counts else 0
-        near = ask(caches, pop[i], file, hashed[i], now, sizes, fill, ttl, coalesce)
+        near = ask(caches, pop[i], file, hashed[i], now, sizes, fill, ttl)
         if counts:
             tables[0, 0, near] += 1
             tables[0, 1, near] += body[i]
@@ -109,7 +109,7 @@ def serve(  # type: ignore[no-untyped-def]
         if near < VALIDATED:
             continue
         fetched = sizes[file] if near == MISS else 0
-        far = ask(caches, shield, file, hashed[i], now, sizes, fill, ttl, coalesce)
+        far = ask(caches, shield, file, hashed[i], now, sizes, fill, ttl)
         if counts:
             tables[1, 0, far] += 1
             tables[1, 1, far] += fetched
@@ -130,12 +130,9 @@ class Site:
     pop_skew: float = 0.5  # their shares of the visits: rank ** -pop_skew
     pop_bytes: float = 20e9  # of each one's cache that this site gets
     shield_bytes: float = 1e12  # 0: no shield
-    coalesce: bool = True  # one fetch for all who ask while it is under way
     fill_seconds: float = 0.3  # that a fetch takes
     edge_ttl: float = 0.0  # for which files without a hash are handed out unasked; 0: as served, `no-cache`
     returning: float = 0.2  # share of visits whose browser has what an earlier visit of the scene left
-    elsewhere: float = 0.1  # share that has seen another scene: it has the viewer, where it is shared
-    shared_viewer: bool = False  # one page for all scenes, by ?bundle=
     mix: tuple[float, ...] = (0.1, 0.4, 0.3, 0.2)  # of the profiles
     diurnal: float = 0.6  # the rate is 1 + diurnal cos(t - 20 h)
     growth: tuple[float, ...] = (1.0,)  # bytes of chunks and packs, one factor drawn for each scene
@@ -145,10 +142,9 @@ class Site:
 
     def check(self, library: Library) -> None:
         """DataError for what cannot be simulated."""
-        shares = (self.returning, self.elsewhere, self.returning + self.elsewhere, self.diurnal)
         fine = (
             min(self.viewers, self.scenes, self.pops) >= 1
-            and all(0 <= share <= 1 for share in shares)
+            and all(0 <= share <= 1 for share in (self.returning, self.diurnal))
             and min(self.pop_bytes, self.shield_bytes, self.warm_days, self.edge_ttl, self.fill_seconds) >= 0
             and min(self.growth, default=0) > 0
         )
@@ -240,9 +236,7 @@ def simulate(library: Library, site: Site) -> Outcome:
     timing = np.array([first, site.fill_seconds, site.edge_ttl])
     for batch in _batches(library, site, objects, tally):
         at, pop, files, hashed, body = batch
-        serve(
-            at, pop, files, hashed, body, objects.size, caches, timing, site.coalesce, tables, origin, minutes
-        )
+        serve(at, pop, files, hashed, body, objects.size, caches, timing, tables, origin, minutes)
     return Outcome(
         site=site,
         visits=int(tally[0]),
@@ -326,8 +320,6 @@ def _requests(
     hashed = library.hashed[b, file]
 
     has = (known[of] < site.returning) & library.kept[b * library.visits + before[of], file]
-    if site.shared_viewer:
-        has |= (known[of] < site.returning + site.elsewhere) & library.page[b, file]
     inside = has & hashed  # never leaves the browser
     unsent = has & ~hashed  # a 304
     counts = at >= site.warm_days * DAY
@@ -339,8 +331,6 @@ def _requests(
     tally[5] += int(body[counts & unsent].sum())
 
     thing = scene[of] * library.kinds.shape[1] + file
-    if site.shared_viewer:
-        thing = np.where(library.page[b, file], file, thing)  # that of the first scene
     out = ~inside
     body = np.where(unsent, 0, body)
     return [at[out], pop[of][out], thing[out], hashed[out], body[out]]

@@ -41,13 +41,10 @@ def expected(library: Library, site: Site) -> tuple[np.ndarray, np.ndarray]:
     kept = library.kept.reshape(bundles, library.visits, files)
     # whose browser has a file: an earlier visit of the same profile kept it
     has = np.stack([kept[:, library.profile == p].mean(1) for p in range(len(library.profiles))], 1)
-    returning = np.full((bundles, files), site.returning)
-    if site.shared_viewer:
-        returning += site.elsewhere * library.page
     row = np.repeat(np.arange(len(library.start) - 1), np.diff(library.start))
     bundle, visit = np.divmod(row, library.visits)
     file = library.file
-    left = share[visit] * (1 - returning[bundle, file] * has[bundle, library.profile[visit], file])
+    left = share[visit] * (1 - site.returning * has[bundle, library.profile[visit], file])
     asked, sent = np.zeros((bundles, files)), np.zeros((bundles, files))
     # a file without a hash is asked for in any case
     np.add.at(asked, (bundle, file), np.where(library.hashed[bundle, file], left, share[visit]))

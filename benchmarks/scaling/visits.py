@@ -25,7 +25,6 @@ class Library:
     kinds: np.ndarray  # [B, F] index into KINDS, -1: padding
     sizes: np.ndarray  # [B, F] bytes over the network
     hashed: np.ndarray  # [B, F] name changes with the content: kept without asking again
-    page: np.ndarray  # [B, F] hashed files of the viewer itself, the same in every bundle
     profile: np.ndarray  # [V] of each visit
     seconds: np.ndarray  # [V] that it lasts
     start: np.ndarray  # [B V + 1] first request of each visit
@@ -84,7 +83,7 @@ def read(paths: Sequence[Path]) -> Library:
     )
 
 
-_PER_FILE = ("kinds", "sizes", "hashed", "page")
+_PER_FILE = ("kinds", "sizes", "hashed")
 
 
 def _read_one(path: Path) -> dict[str, Any]:
@@ -130,7 +129,6 @@ def _tables(one: dict[str, Any], longest: int) -> dict[str, np.ndarray]:
         "kinds": kinds,
         "sizes": sizes,
         "hashed": hashed,
-        "page": page,
         "seconds": np.array([visit["seconds"] for _, visit in visits]),
         "counts": np.array([len(visit["requests"]) for _, visit in visits]),
         "at": np.array(at),
