@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from benchmarks.gpu import gsplat_trainer
-from benchmarks.gpu.base import Bench, Clock, Outcome, milliseconds, one_line, wait
+from benchmarks.gpu.base import Bench, Clock, Outcome, one_line, wait
 from benchmarks.gpu.split import grown, stages
 from sagesplat.adapt.observe import render_rgb
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import SageError
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.metrics.image import photometric_loss, psnr, ssim_map
+from sagesplat.metrics.image import psnr, ssim_map
 from sagesplat.metrics.lpips import Net, load_lpips
 from sagesplat.raster import rasterize
 from sagesplat.train import densify, trainer
@@ -44,7 +44,6 @@ class Run:
     gaussians: Gaussians  # on the CPU
     peak_mib: float
     stopped: str | None  # why it did not end by itself
-    settings: dict[str, Any]
 
     def figures(self) -> dict[str, Any]:
         """All but the Gaussians."""
@@ -97,8 +96,6 @@ def race(bench: Bench) -> Outcome:
     times = {end: {name: run.reaches(ssim) for name, run in runs.items()} for end, ssim in finals.items()}
     figures: dict[str, Any] = {"final_ssim": finals, "seconds_to_the_end_of": times, "missed": missed}
     figures["runs"] = {name: run.figures() for name, run in runs.items()}
-    if not bench.small:
-        figures["loss_ms"] = loss_times(bench)
     parts = []
     for name, run in runs.items():
         others = ((n, t) for n, t in times[name].items() if n != name and n in ("gsplat", "ours"))
@@ -191,10 +188,10 @@ def gsplats(bench: Bench, config: TrainConfig, mcmc: bool = False) -> Iterator[M
     """gsplat's recipe, or its MCMC with as many Gaussians as ours; photos are on the device at the start."""
     rows = bench.scene.train_ids.tolist()
     photos = [torch.from_numpy(bench.photos[row]).to(bench.device).float() / 255 for row in rows]
-    cameras, (_, loss) = [bench.scene.views[row].camera for row in rows], gsplat_trainer.losses()
+    cameras = [bench.scene.views[row].camera for row in rows]
     camera, points = cameras[0], len(bench.scene.points.xyz)
     most = densify.cap(config, camera.width * camera.height, points) if mcmc else 0
-    return gsplat_trainer.train(bench.initial(), cameras, photos, bench.scene.extent, config, loss, cap=most)
+    return gsplat_trainer.train(bench.initial(), cameras, photos, bench.scene.extent, config, cap=most)
 
 
 def watch(bench: Bench, name: str, config: TrainConfig, moments: Iterator[Moment]) -> Run:
@@ -221,10 +218,7 @@ def watch(bench: Bench, name: str, config: TrainConfig, moments: Iterator[Moment
         clock.stop()
     assert last is not None
     peak = torch.cuda.max_memory_allocated(bench.device) / 2**20 if bench.device.type == "cuda" else 0.0
-    settings: dict[str, Any] = {"max_steps": config.max_steps}
-    if name in ("gsplat", "mcmc"):
-        settings["loss"] = gsplat_trainer.losses()[0]
-    return Run(name, last[0], clock.seconds, curve, last[1].to("cpu"), peak, stopped, settings)
+    return Run(name, last[0], clock.seconds, curve, last[1].to("cpu"), peak, stopped)
 
 
 @torch.no_grad()
@@ -254,18 +248,6 @@ def lpips(bench: Bench, g: Gaussians, net: Net) -> float:
         image = render_rgb(there, bench.scene.views[row].camera, backend=bench.backend, antialiased=False)
         values.append(metric(image, bench.photos[row].astype(np.float32) / 255))
     return float(np.mean(values))
-
-
-def loss_times(bench: Bench) -> dict[str, float]:
-    """Milliseconds of the race's losses and their gradients, so that its times can be put right."""
-    camera = bench.scene.views[0].camera
-    photo = torch.rand(camera.height, camera.width, 3, device=bench.device)
-    name, recipe = gsplat_trainer.losses()
-    found = {}
-    for of, loss in {"ours": photometric_loss, "torch": gsplat_trainer.torch_loss, name: recipe}.items():
-        rgb = torch.rand_like(photo).requires_grad_()
-        found[of] = milliseconds(bench.device, lambda loss=loss, rgb=rgb: loss(rgb, photo, 0.2).backward())
-    return found
 
 
 def time_to(curve: Sequence[tuple[float, float]], ssim: float) -> float | None:
