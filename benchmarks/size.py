@@ -17,7 +17,7 @@ import tyro
 
 from benchmarks.common import finish
 from benchmarks.promises import CASES
-from benchmarks.size_tables import AS_ONE, TRAINED, Measured, summary, table, write_survey
+from benchmarks.size_tables import AS_ONE, TRAINED, Measured, summary, table
 from sagesplat.core.config import (
     CleanConfig,
     CompareConfig,
@@ -99,7 +99,7 @@ class Asked:
     lpips: Path | None = None
     """Folder with the LPIPS weights."""
     vgg: bool = False
-    """LPIPS of VGG too, which takes longest of all that is measured (always for the survey)."""
+    """LPIPS of VGG too, which takes longest of all that is measured."""
     device: str = "auto"
     """cpu, cuda, or auto."""
     seed: int = 0
@@ -308,7 +308,6 @@ def main(
     scenes: tuple[str, ...] = tuple(SCENES),
     asked: tyro.conf.OmitArgPrefixes[Asked] = Asked(),
     threads: int = 0,
-    survey: bool = False,
     write: bool = False,
 ) -> None:
     """Bytes at equal SSIM beside sets made for one size, and what nesting costs.
@@ -317,11 +316,10 @@ def main(
         folder: where runs are made; what is done already is skipped.
         scenes: garden, dinosaur, built-in, folders of captures, or run folders with a training.
         threads: 0: one per core.
-        survey: also write FOLDER/survey, rows as the public compression survey has them.
         write: keep the figures in benchmarks/results/size.json.
     """
     set_threads(threads)
-    asked, results = replace(asked, vgg=asked.vgg or survey), {}
+    results = {}
     for scene in scenes:
         begin = time.perf_counter()
         try:
@@ -330,9 +328,6 @@ def main(
             raise SystemExit(str(error)) from None
         shown = table(found)
         print(f"\n{shown.title}\n\n{shown.markdown()}")
-        if survey:
-            for path in write_survey(folder / "survey", found):
-                print(f"{path}\n{path.read_text()}")
         results[found.scene] = summary(found) | {"measured_in_s": time.perf_counter() - begin}
     finish("size", {"scenes": results}, write, "")
 

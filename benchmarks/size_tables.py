@@ -1,13 +1,10 @@
-"""What `benchmarks.size` prints: ratios at equal SSIM, the bars of it, and rows of the compression survey."""
+"""What `benchmarks.size` prints: ratios of bytes at equal SSIM."""
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from sagesplat.io.files import atomic_path
 from sagesplat.output.table import Table
 from sagesplat.output.tables import MB
 from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point, least
@@ -15,12 +12,7 @@ from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, 
 AS_ONE, TRAINED = "3DGS, as one", "3DGS"  # methods beside those of `sagesplat compare`
 BASELINES = (SNAPSHOTS, PRUNED, MCMC)
 OUTSIDE = "above our top"  # a baseline whose SSIM none of our levels reaches
-SURVEY = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")  # w-m/3dgs-compression-survey
 _LOW = 4  # levels that count as the lowest
-# folder of a method's rows in the survey's layout
-_FOLDERS = {
-    SAME_SHARE: "sagesplat", MCMC: "3dgs-mcmc", PRUNED: "3dgs-pruned", TRAINED: "3dgs", AS_ONE: "3dgs-as-one",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,7 +58,6 @@ def summary(measured: Measured) -> dict[str, Any]:
         "bytes_ratio": ratios,  # of plans within a budget
         "bytes_ratio_same_share": same_share,
         "worst_ratio": {name: _worst(rows) for name, rows in ratios.items() if rows},
-        "bars": bars(full, as_one, ratios, figures),
     }
 
 
@@ -82,24 +73,6 @@ def _worst(rows: Mapping[str, Mapping[str, Any]]) -> float | None:
     """The largest ratio; None where one of them is outside of our curve."""
     values = [row["ratio"] for row in rows.values()]
     return None if None in values else max(values)
-
-
-def bars(
-    full: Point, as_one: Point, ratios: Mapping[str, Mapping[str, Any]], figures: Mapping[str, Any]
-) -> dict[str, bool]:
-    """Whether each bar is met."""
-    worst = {name: _worst(rows) for name, rows in ratios.items() if rows}
-    return {
-        "top within 0.1 dB of as one": full.psnr >= as_one.psnr - 0.1,
-        **{f"bytes at most those of {n}": _most(worst[n], 1.0) for n in (MCMC, PRUNED) if n in worst},
-        **{f"0.6 of the bytes of {n}": _most(worst[n], 0.6) for n in (SNAPSHOTS,) if n in worst},
-        "12 bytes a Gaussian": full.encoded / figures["trained_gaussians"] <= 12,
-        "100 k encoded in 20 s": figures["encoding_s_per_100k"] <= 20,
-    }
-
-
-def _most(value: float | None, bar: float) -> bool:
-    return value is not None and value <= bar
 
 
 def _quality(point: Point) -> dict[str, float | None]:
@@ -135,34 +108,6 @@ def table(measured: Measured) -> Table:
         body,
         marks=marks,
     )
-
-
-def write_survey(folder: Path, measured: Measured, dataset: str = "MipNeRF360") -> list[Path]:
-    """FOLDER/METHOD/DATASET/SCENE.csv: rows as authors hand them in to the public compression survey.
-
-    LPIPS is VGG's as 3DGS computes it; empty where its weights are missing. Our full model and the level
-    next to a third of its bytes have names, which the survey's table shows; the others are in its plots.
-    """
-    written = []
-    for method, name in _FOLDERS.items():
-        points = sorted(_of(measured.points, method), key=lambda p: -p.encoded)
-        if not points:
-            continue
-        away = {abs(math.log(3 * p.encoded / points[0].encoded)): p.name for p in points[1:]}
-        names = {points[0].name: "Baseline"} | ({away[min(away)]: "-Third"} if away else {})
-        rows = [(names.get(p.name, ""), *survey_row(p)) for p in points]
-        path = folder / name / dataset / f"{measured.scene}.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary, temporary.open("w", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([SURVEY, *rows])
-        written.append(path)
-    return written
-
-
-def survey_row(point: Point) -> tuple[str, str, str, int, int]:
-    """PSNR, SSIM, LPIPS, bytes and Gaussians of a set, with the survey's digits and more."""
-    lpips = "" if math.isnan(point.lpips_vgg) else f"{point.lpips_vgg:.5f}"
-    return f"{point.psnr:.4f}", f"{point.ssim:.5f}", lpips, point.encoded, point.count
 
 
 def _of(points: Sequence[Point], method: str) -> list[Point]:

@@ -1,6 +1,5 @@
 """A bundle over slow networks: bytes and seconds to the first picture, to a target, and in all."""
 
-import csv
 import threading
 import time
 from collections.abc import Sequence
@@ -8,23 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 
 from benchmarks.common import finish
-from sagesplat.output.figures import STYLE
 from sagesplat.stages.view import show
 from tests.browser import Opened, launch, open_page
 
 NETWORKS = (2.0, 10.0, 50.0)  # Mbit/s
 LATENCY = 100.0  # ms
 TARGETS = (0.8, 0.9, 0.95)  # of fidelity
-WAYS = {  # in curve.csv: what they are called, colour, line, width
-    "streamed": ("streams, best first", "#2f7458", "-", 2.2),
-    "fidelity 0.95": ("streams, until fidelity 0.95", "#d1780b", "-", 2.2),
-    "file order": ("streams, category by category", "#5b6bf0", "--", 1.5),
-    "one file": ("everything in one file", "#e5484d", ":", 2.0),
-}
 _QUIET = 1.5  # seconds without a change after which nothing more comes
 _STATE = """() => {
   const view = window.sagesplat
@@ -135,52 +125,16 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def figure(curves: Path, out: Path) -> None:
-    """Fidelity over time of curve.csv, as `node web/test/network.report.mjs` writes it, by link."""
-    with curves.open() as file:
-        rows = list(csv.DictReader(file))
-    links = sorted({float(row["mbit"]) for row in rows})
-    with rc_context(STYLE):
-        picture = Figure(figsize=(10, 3.4), layout="constrained")
-        for axes, link in zip(picture.subplots(1, len(links), sharey=True), links, strict=True):
-            end = 0.0
-            for way, (title, color, line, width) in WAYS.items():
-                mine = [r for r in rows if (float(r["mbit"]), r["connections"], r["way"]) == (link, "6", way)]
-                time, ssim = ([float(r[name]) for r in mine] for name in ("seconds", "ssim"))
-                axes.step(time, ssim, line, where="post", color=color, lw=width, label=title)
-                end = max(end, *time) if way != "file order" else end
-            axes.set(
-                title=f"{link:g} Mbit/s", xlabel="seconds after the page", xlim=(0, 1.2 * end), ylim=(0, 1.03)
-            )
-        picture.axes[0].set_ylabel("expected fidelity")
-        picture.legend(
-            *picture.axes[0].get_legend_handles_labels(),
-            loc="outside upper center",
-            ncols=len(WAYS),
-            fontsize=10,
-        )
-        picture.savefig(out, dpi=120, pil_kwargs={"optimize": True})
-
-
-def main(
-    bundle: Path | None = None, curves: Path | None = None, out: Path | None = None, write: bool = False
-) -> None:
+def main(bundle: Path, write: bool = False) -> None:
     """A bundle in Chromium at 2, 10, 50 Mbit/s: bytes and seconds to the first picture and to targets.
 
     Args:
         bundle: folder of the bundle.
-        curves: instead of that, curve.csv as `node web/test/network.report.mjs` writes it, which is drawn.
-        out: picture of the curves.
         write: keep the figures in benchmarks/results/cpu.
     """
-    if curves and out:
-        figure(curves, out)
-    elif bundle:
-        result = measure(bundle)
-        print(table(result))
-        finish("viewer", result, write)
-    else:
-        raise SystemExit("viewer: name a bundle (--bundle), or curves and a picture (--curves, --out)")
+    result = measure(bundle)
+    print(table(result))
+    finish("viewer", result, write)
 
 
 if __name__ == "__main__":

@@ -266,6 +266,35 @@ def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
+@pytest.fixture
+def run(finished_run: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run, to change, with a link to its capture beside it."""
+    (tmp_path / "capture").symlink_to(finished_run.parent / "capture")
+    return Path(shutil.copytree(finished_run, tmp_path / "run"))
+
+
+def job_of(run: Path, emit: Callable[[Event], None] = lambda event: None, **options: Any) -> Job:
+    return Job(RunDir(run), emit, "cpu", **options)
+
+
+@pytest.fixture
+def viewer(tmp_path: Path) -> Path:
+    """A folder with a page in place of the built viewer."""
+    (tmp_path / "viewer").mkdir()
+    (tmp_path / "viewer" / "index.html").write_text("<body><!-- pack --><!-- poster --></body>")
+    return tmp_path / "viewer"
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The modelled garden: 12 photos of 64 x 48 pixels, to read only."""
+
+    def make(folder: Path) -> None:
+        make_demo_capture(folder / "capture", views=12, width=64, height=48)
+
+    return shared(tmp_path_factory, "garden", make) / "capture"
+
+
 Call = Callable[..., tuple[int, str]]
 
 

@@ -162,9 +162,8 @@ def test_measured_at_takes_views_with_all_levels():
 
 @pytest.mark.parametrize("confidence", [0.0, 1.0, -1, 95, float("nan")])
 def test_impossible_confidence(confidence):
-    with pytest.raises(RunError, match="confidence") as error:
+    with pytest.raises(RunError, match="confidence"):
         fit_photo_models(synthetic(SCENE, 1), SCENE, confidence)
-    assert "\n" not in str(error.value)
 
 
 def test_values_that_are_no_numbers_are_left_out(model):

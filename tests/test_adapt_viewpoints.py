@@ -97,14 +97,6 @@ def test_all_cameras_in_one_place_and_a_single_one():
 
 
 @pytest.mark.parametrize(
-    "rule", [Rule(neighbours=-1), Rule(shift=-0.1), Rule(shift=float("nan")), Rule(turn=4.0)]
-)
-def test_rules_that_cannot_be_followed(rule):
-    with pytest.raises(RunError, match=r"--sample\.\w+ \S+ is impossible; choose a number from 0"):
-        draw(SCENE, capture_cameras(SCENE), rule, {"fit": 1})
-
-
-@pytest.mark.parametrize(
     ("rule", "says"),
     [
         (Rule(screens=(2.0, 0.5)), r"^--sample\.screens 2 0\.5: from the smaller to the larger: 0\.5 2$"),

@@ -11,10 +11,9 @@ import torch
 from conftest import random_gaussians, write_capture
 
 from benchmarks.gpu import __main__ as script
-from benchmarks.gpu import agreement, base, gsplat_trainer, runs, split
+from benchmarks.gpu import base, gsplat_trainer, split
 from sagesplat.core.config import TrainConfig
 from sagesplat.demo.capture import make_capture
-from sagesplat.metrics.image import photometric_loss, ssim_map
 from sagesplat.raster import cuda, rasterize
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera
@@ -43,18 +42,11 @@ def test_a_trial_of_the_whole_script(tmp_path, capsys):
     figures = tried(tmp_path)
     table = capsys.readouterr().out.splitlines()[-len(script.CHECKS) :]
     assert [line.split()[:2] for line in table] == [
-        ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["freeze", "ok"], ["split", "ok"],
-        ["multi", "skipped"],
+        ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["split", "ok"], ["multi", "skipped"],
     ]  # fmt: skip
     race = figures["race"]["figures"]
-    assert set(race["runs"]) == {"ours", "third", "two_thirds", "all"}
-    assert set(race["missed"]) == {"gsplat"}
-    assert race["runs"]["third"]["settings"]["skipped"] > 0
+    assert (set(race["runs"]), set(race["missed"])) == ({"ours"}, {"gsplat", "mcmc", "large"})
     assert set(figures["split"]["figures"]["kernels"]) == {*(name for name, _ in split.KERNELS), "rest"}
-
-
-def test_the_tests_of_the_kernels_are_where_the_script_looks():
-    assert all((Path(__file__).parent / f"{name}.py").exists() for name in agreement.TESTS)
 
 
 def test_a_machine_without_a_gpu_says_so_in_one_line(capsys):
@@ -67,29 +59,7 @@ def test_a_machine_without_a_gpu_says_so_in_one_line(capsys):
     assert "; " in line or " or use --device cpu" in line
 
 
-def test_targets_are_what_so_many_labels_have_reached():
-    reached = {1: 0.9019, 2: 0.8, 3: 0.7, 4: 0.6, 5: 0.5, 6: 0.4007}
-    found = runs.targets(reached)
-    assert found == {"third": 0.8, "two_thirds": 0.6, "all": 0.4}
-    for name, share in (("third", 2), ("two_thirds", 4), ("all", 6)):
-        assert sum(ssim >= found[name] for ssim in reached.values()) == share
-    assert runs.targets({1: 0.75}) == {"third": 0.75, "two_thirds": 0.75, "all": 0.75}
-
-
 # --- gsplat's recipe -------------------------------------------------------------------------------------
-
-
-def test_the_losses_agree():
-    generator = torch.Generator().manual_seed(0)
-    x = torch.rand(40, 50, 3, generator=generator)
-    y = (x + 0.1 * torch.randn(40, 50, 3, generator=generator)).clamp(0, 1)
-    ours, plain = photometric_loss(x, y, 0.0), gsplat_trainer.torch_loss(x, y, 0.0)
-    torch.testing.assert_close(plain, ours)
-    inner = 1 - ssim_map(x.numpy(), y.numpy())[5:-5, 5:-5].mean()
-    torch.testing.assert_close(float(gsplat_trainer.torch_loss(x, y, 1.0)), float(inner), rtol=0, atol=1e-5)
-    name, loss = gsplat_trainer.losses()
-    assert name in ("fused_ssim", "ours", "torch")
-    assert torch.isfinite(loss(x, y, 0.2))
 
 
 def test_the_recipe_trains_and_densifies(tmp_path, monkeypatch):
@@ -134,9 +104,7 @@ def test_the_recipe_trains_and_densifies(tmp_path, monkeypatch):
         renders = [rasterize(g, camera).rgb for camera in cameras]
         return float(torch.stack([(r - p).abs().mean() for r, p in zip(renders, photos, strict=True)]).mean())
 
-    found = list(
-        gsplat_trainer.train(initial, cameras, photos, scene.extent, config, gsplat_trainer.torch_loss)
-    )
+    found = list(gsplat_trainer.train(initial, cameras, photos, scene.extent, config))
     assert [step for step, _ in found] == [40, 80, 120]
     assert len(found[-1][1]) > len(initial)
     assert error(found[-1][1]) < 0.7 * error(initial)

@@ -10,7 +10,7 @@ import torch
 from benchmarks.runtime import __main__ as runtime
 from benchmarks.runtime import playcanvas, spark
 from benchmarks.runtime.levels import opened, ours
-from benchmarks.runtime.measure import Walked, fidelity
+from benchmarks.runtime.measure import fidelity
 from benchmarks.runtime.walk import recorded
 from sagesplat.adapt.observe import render_rgb
 from sagesplat.core.gaussians import Gaussians
@@ -152,37 +152,6 @@ def test_a_tree_of_spark_is_read():
     np.testing.assert_array_equal(tree.splats.shN[1:], g.shN)
 
 
-def test_a_page_of_spark_takes_what_its_encodings_do():
-    g = random_gaussians(500, degree=1)
-    nothing = np.zeros(500, np.int64)
-    tree = spark.Tree(g, np.full(500, 0.5), g.means.numpy(), np.ones(500, np.float32), nothing, nothing)
-    (page,) = spark.page_bytes(tree)
-    assert (
-        15 * 500 < page - 1500 < 36 * 500
-    )  # 12 of positions, 3 each of the rest, 9 of harmonics, less deflate
-
-
-def test_curves_meet_at_counts_and_leave_out_what_costs_more_for_less():
-    whole = np.array([[0.5, 0.8, 0.7, 0.92], [0.7, 0.8, 0.7, 0.98]])
-    count = np.array([[100, 1000, 2000, 4000.0]] * 2)
-    walked = Walked("some", (1, 2, 3, 4), whole, whole - 0.1, count, 10 * count)
-    mean, low, lowest = walked.at("count", np.array([50, 100, 100 * 10**0.5, 1000, 2000, 9000]))
-    np.testing.assert_allclose(mean, [np.nan, 0.6, 0.7, 0.8, 0.875, 0.95])
-    np.testing.assert_allclose(low[[1, 3, 5]], [0.51, 0.8, 0.923])
-    np.testing.assert_allclose(lowest[1:], mean[1:] - 0.1)
-    assert walked.first_bytes() == 40_000
-    np.testing.assert_allclose(walked.at("bytes", np.array([1000]))[0], 0.6)
-
-
-def test_the_lowest_category_has_enough_pixels_and_a_name():
-    full = np.random.default_rng(0).random((40, 50, 3)).astype(np.float32)
-    image, labels = full.copy(), np.ones((40, 50), np.int16)
-    labels[:20], labels[0, :2], labels[30:] = 2, 3, -1
-    image[:, :2], image[30:] = 0, 0
-    whole, lowest = fidelity(image, full, labels)
-    assert 0.5 < whole < 0.8 < lowest < 1
-
-
 def test_a_run_is_measured_on_the_same_walk_each_time(finished_run, tmp_path, capsys):
     runtime.main((finished_run,), folder=tmp_path, every=40)
     out = capsys.readouterr().out.splitlines()
@@ -204,24 +173,6 @@ def test_a_run_is_measured_on_the_same_walk_each_time(finished_run, tmp_path, ca
     assert (np.diff(levels[:, :3].sum(2), axis=1) >= 0).all()
     taken = counts[np.arange(levels.shape[2]), levels[:, :3] - 1].sum(2)
     assert (taken <= np.maximum(np.array(shares) * counts[:, -1].sum(), counts[:, 0].sum())).all()
-
-
-def test_levels_of_playcanvas_are_made_once(tmp_path):
-    tool = tmp_path / "tool"
-    touch = "for word; do case $word in *.ply|*.json) touch $word;; esac; done"
-    tool.write_text(f'#!/bin/sh\necho "$@" >> "$0.log"\n{touch}\n')
-    tool.chmod(0o755)
-    model = tmp_path / "full.ply"
-    model.touch()
-    meta = playcanvas.made(model, tool, 3, 40.0, 0)
-    assert meta == playcanvas.made(model, tool, 3, 40.0, 0)
-    *halved, bundled = (tmp_path / "tool.log").read_text().splitlines()
-    assert [line.split("--decimate ")[1].split()[0] for line in halved] == [
-        "50%", "25%", "12.5%", "6.25%", "3.125%", "1.5625%"
-    ]  # fmt: skip
-    assert f"{model} -l 0 {tmp_path}/decimated-1.ply -l 1 {tmp_path}/decimated-2.ply -l 2" in bundled
-    assert "--lod-chunk-count 3 --lod-chunk-extent 5" in bundled
-    assert bundled.endswith(f"decimated-6.ply -l 6 {meta} --filter-harmonics 0")
 
 
 def test_streamed_sog_of_playcanvas_is_drawn_by_its_budget(finished_run, tmp_path):

@@ -1,13 +1,12 @@
-"""Ratios at equal SSIM, bars and survey rows on made-up curves."""
+"""Ratios at equal SSIM, summaries on made-up curves."""
 
-import csv
 import json
 import math
 from dataclasses import replace
 
 import pytest
 
-from benchmarks.size_tables import AS_ONE, OUTSIDE, SURVEY, TRAINED, Measured, ratio, summary, write_survey
+from benchmarks.size_tables import AS_ONE, OUTSIDE, TRAINED, Measured, ratio, summary
 from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point
 
 
@@ -39,7 +38,7 @@ def test_bytes_at_equal_ssim():
     assert ratio(OURS, replace(point(MCMC, "cap 5%", 5000, 0.9), ssim_sent=0.7))[0] == 2.0
 
 
-def test_summary_and_bars():
+def test_summary():
     caps = [point(MCMC, "cap 10%", 9000, 0.7), point(MCMC, "cap 50%", 120_000, 0.9)]
     found = summary(measured(*caps, point(SNAPSHOTS, "step 9", 20_000, 0.7), point(PRUNED, "5%", 500, 0.95)))
     found = json.loads(json.dumps(found, allow_nan=False))
@@ -54,22 +53,3 @@ def test_summary_and_bars():
         "level 1": 20.0,
         "levels 1 to 4": 20.0,
     }
-    assert found["bars"] == {
-        "top within 0.1 dB of as one": True,
-        f"bytes at most those of {MCMC}": True,
-        f"bytes at most those of {PRUNED}": False,
-        f"0.6 of the bytes of {SNAPSHOTS}": True,
-        "12 bytes a Gaussian": True,
-        "100 k encoded in 20 s": True,
-    }
-
-
-def test_survey_rows(tmp_path):
-    paths = write_survey(tmp_path, measured(point(MCMC, "cap 10%", 2000, 0.6)))
-    ours = tmp_path / "sagesplat" / "MipNeRF360" / "yard.csv"
-    assert ours in paths
-    rows = list(csv.reader(ours.read_text().splitlines()))
-    assert tuple(rows[0]) == SURVEY
-    assert rows[1] == ["Baseline", "22.0000", "0.90000", "0.25000", "100000", "5000"]
-    assert [row[0] for row in rows[1:]] == ["Baseline", "-Third", ""]
-    assert {path.parts[-3] for path in paths} == {"sagesplat", "3dgs-mcmc", "3dgs", "3dgs-as-one"}

@@ -1,7 +1,6 @@
 """The command line: errors are one line and exit code 2, and help answers at once."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -107,18 +106,6 @@ def test_targets_of_both_qualities(
     config = check_targets(seen["config"].plan, seen["config"].ladder)
     assert config.all_targets == targets
     assert (config.quality, config.target) in config.all_targets
-
-
-@pytest.mark.parametrize("words", ["--target-fidelity 0", "--target-fidelity 1.5", "--target-fidelity nan",
-                                   "--target-ssim -0.1", "--target-fidelity 0.9 --target-ssim nan",
-                                   "--target-fidelity 0.9 --other-targets 0.5 2",
-                                   "--ladder snapshots --target-fidelity 0.9"])  # fmt: skip
-def test_impossible_targets_are_one_line_before_anything_is_read(
-    tmp_path: Path, words: str, command: Call
-) -> None:
-    code, line = command("run", str(tmp_path), str(tmp_path / "run"), *words.split())
-    assert code == 2
-    assert re.search("target.* is impossible; choose|needs the nested ladder; give", line)
 
 
 def test_the_overview_loads_no_command() -> None:

@@ -64,14 +64,6 @@ def test_its_settings_are_the_defaults_of_the_next_call(finished: Path, command:
     assert "✓" not in said  # nothing is redone
 
 
-def test_its_report_speaks_of_renders(finished: Path) -> None:
-    page = (finished / "nested" / "report" / "index.html").read_text()
-    for text in ("The splat that came in", "ball.ply", "merged Gaussians, not trained", "unseen renders"):
-        assert text in page
-    for text in ("photos that neither", "unseen photos", "drawn within the capture", ">photo<"):
-        assert text not in page
-
-
 @pytest.mark.usefixtures("up_to_levels")
 def test_another_splat_replaces_it_only_with_force(finished: Path, tmp_path: Path, command: Call) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))

@@ -17,7 +17,6 @@ from sagesplat.cli.console import Console
 from sagesplat.core.config import FitConfig, PlanConfig, TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped, Training, Warned
-from sagesplat.demo.capture import make_capture
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json
 from sagesplat.run.job import Job
@@ -28,18 +27,11 @@ from sagesplat.stages import plan as plan_stage
 from sagesplat.stages.train import train_levels
 from sagesplat.studies.paper.snapshots import adapt_snapshots
 
-SETTINGS = "--train.max-steps 60 --train.level-every 30 --ladder snapshots --target-ssim 0.4 --test-every 6"
+SETTINGS = "--train.max-steps 12 --train.level-every 6 --ladder snapshots --target-ssim 0.4 --test-every 6"
 
 
 class Killed(Exception):
     """What a test kills a stage with."""
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=12, width=64, height=48)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +111,7 @@ def test_a_refusal_says_what_differs_and_its_cure_works(run: Path, command: Call
 
 def test_settings_of_a_run_reach_every_command(run: Path) -> None:
     known = recorded_settings(RunDir(run, "snapshots"))
-    assert known["train"] == TrainConfig(max_steps=60, level_every=30)
+    assert known["train"] == TrainConfig(max_steps=12, level_every=6)
     assert known["plan"] == PlanConfig(target_ssim=0.4)
     assert known["fit"] == FitConfig()
     assert known["masks"].segmenter == "auto"
@@ -142,7 +134,7 @@ def test_given_flags_win_and_another_source_of_label_images_drops_the_recorded_o
     (run / "segmented" / "options.json").write_text('{"segmenter": "hf", "model": "a/b", "crf": true}')
     assert command("run", capture, run, "--train.max-steps=70", "--seed", "4")[0] == 0
     config = seen["config"]
-    assert (config.train.max_steps, config.train.level_every, config.seed) == (70, 30, 4)
+    assert (config.train.max_steps, config.train.level_every, config.seed) == (70, 6, 4)
     assert (config.masks.model, config.masks.crf, seen["run"].ladder) == ("a/b", True, "snapshots")
     assert command("run", capture, run, "--masks", capture / "masks")[0] == 0
     assert (seen["config"].masks.segmenter, seen["config"].masks.model) == ("auto", None)
@@ -177,23 +169,23 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_killed_forced_training_resumes_and_the_earlier_levels_stay_until_then(run: Path) -> None:
-    paths, other = RunDir(run), TrainConfig(max_steps=80, level_every=20)
+    paths, other = RunDir(run), TrainConfig(max_steps=16, level_every=4)
     levels, record = files(paths.levels), paths.provenance("train").read_bytes()
 
     def kill(event: Event) -> None:
-        if isinstance(event, Training) and event.step == 45:
+        if isinstance(event, Training) and event.step == 9:
             raise Killed
 
     with pytest.raises(Killed):
         train_levels(job(run, kill), other, 0)
     assert files(paths.levels) == levels
     assert paths.provenance("train").read_bytes() == record
-    train_levels(job(run, print, force=False), TrainConfig(max_steps=60, level_every=30), 0)  # up to date
+    train_levels(job(run, print, force=False), TrainConfig(max_steps=12, level_every=6), 0)  # up to date
     events: list[Event] = []
     train_levels(job(run, events.append), other, 0)
-    assert min(e.step for e in events if isinstance(e, Training)) == 41
-    assert sorted(files(paths.levels)) == ["000020.npz", "000040.npz", "000060.npz", "000080.npz"]
-    assert read_json(paths.provenance("train"))["settings"]["max_steps"] == 80
+    assert min(e.step for e in events if isinstance(e, Training)) == 9
+    assert sorted(files(paths.levels)) == ["000004.npz", "000008.npz", "000012.npz", "000016.npz"]
+    assert read_json(paths.provenance("train"))["settings"]["max_steps"] == 16
     assert not paths.replacement.path.exists()
     assert recorded_settings(paths)["train"] == other
 
@@ -202,7 +194,7 @@ def test_a_killed_forced_training_resumes_and_the_earlier_levels_stay_until_then
 def test_a_swap_that_is_killed_is_finished_by_the_same_command(
     at: int, run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    paths, other, moves = RunDir(run), TrainConfig(max_steps=40, level_every=20), []
+    paths, other, moves = RunDir(run), TrainConfig(max_steps=4, level_every=2), []
 
     def dying(move: Callable[..., object]) -> Callable[..., object]:
         def moved(self: Path, *args: object) -> object:
@@ -225,8 +217,8 @@ def test_a_swap_that_is_killed_is_finished_by_the_same_command(
     events: list[Event] = []
     train_levels(job(run, events.append, force=False), recorded_settings(paths)["train"], 0)
     assert not [e for e in events if isinstance(e, Training)]
-    assert sorted(files(paths.levels)) == ["000020.npz", "000040.npz"]
-    assert len(read_level(paths.levels / "000040.npz"))
+    assert sorted(files(paths.levels)) == ["000002.npz", "000004.npz"]
+    assert len(read_level(paths.levels / "000004.npz"))
     assert not paths.replacement.path.exists()
 
 

@@ -44,15 +44,6 @@ def test_a_run_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
     assert (tmp_path / "run" / "nested" / "report" / "index.html").exists()
 
 
-def test_masks_over_those_of_the_capture(folder: Path, tmp_path: Path, command: Call) -> None:
-    words = ("--prompts", "ivy", "--prompt-model", folder / "clipseg", "--prompt-threshold", "0.01")
-    code, said = command("masks", folder / "capture", tmp_path / "run", *words)
-    assert code == 0, said
-    before = names_of(folder / "capture" / "masks")
-    assert "ivy" in names_of(tmp_path / "run" / "masks")
-    assert set(names_of(tmp_path / "run" / "masks")) <= {"ivy", *before}
-
-
 def test_a_splat_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
     g = random_gaussians(300, degree=1, logit=2.0)
     write_ply(tmp_path / "ball.ply", replace(g, label_ids=torch.full_like(g.label_ids, -1)))
@@ -74,34 +65,3 @@ def test_a_splat_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
     code, said = command("adopt", tmp_path / "ball.ply", tmp_path / "run", *words, *small, *SMALL[8:])
     assert code == 0, said
     assert set(names_of(tmp_path / "run" / "masks")) <= set(PROMPTS.split("; "))
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (("--prompts", "ivy; Ivy"), "prompts: 'ivy' and 'Ivy' mean the same; leave one of them"),
-        (("--prompts", "ivy;; bench"), "one is empty; write --prompts"),
-        (("--prompts", "ivy\nbench"), "a name has 1 to 100 printable characters"),
-        (("--segmenter", "text"), "--segmenter text needs --prompts"),
-        (("--prompts", "ivy", "--labels.instances", "chair 7"), "chair 7"),
-    ],
-)
-def test_bad_words_are_one_line(
-    folder: Path, tmp_path: Path, command: Call, words: tuple[str, ...], line: str
-) -> None:
-    network = ("--prompt-model", folder / "clipseg", "--segmenter", "text")
-    code, said = command("run", folder / "capture", tmp_path / "run", *network, *words)
-    assert code == 2, said
-    assert "Traceback" not in said
-    last = said.splitlines()[-1]
-    assert last.startswith("sagesplat: ")
-    assert line in last
-
-
-def test_names_of_any_script_and_with_markup(folder: Path, tmp_path: Path, command: Call) -> None:
-    name = "喷泉 & <script>"
-    network = ("--model", folder / "clipseg", "--prompt-threshold", "0.01")
-    words = ("--segmenter", "text", "--prompts", name, *network)
-    code, said = command("masks", folder / "capture", tmp_path / "run", *words)
-    assert code == 0, said
-    assert names_of(tmp_path / "run" / "masks") == [name]

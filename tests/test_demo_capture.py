@@ -1,13 +1,9 @@
-import json
-
 import numpy as np
 import pytest
 from PIL import Image
 
-from sagesplat.core.errors import SceneError
-from sagesplat.demo import capture
 from sagesplat.demo.cameras import demo_cameras
-from sagesplat.demo.capture import cached_capture, make_capture
+from sagesplat.demo.capture import make_capture
 from sagesplat.demo.points import UV_NOISE, project
 from sagesplat.demo.world import LABELS
 from sagesplat.scene.colmap import load_colmap
@@ -51,11 +47,6 @@ def test_loads_as_a_scene(scene):
     assert 2.0 < scene.extent < 8.0
 
 
-def test_labels_file_names_what_the_masks_hold(workspace):
-    content = json.loads((workspace / "masks" / "labels.json").read_text())
-    assert set(np.unique(masks(workspace))) == {int(i) for i in content["labels"]} == set(LABELS)
-
-
 def test_tracks_agree_with_the_poses(scene):
     points = scene.points
     length = np.bincount(points.track_points, minlength=len(points.xyz))
@@ -83,22 +74,6 @@ def test_track_labels_agree(workspace, scene):
     assert (votes.max(1) / votes.sum(1)).mean() > 0.85
 
 
-def test_cache_is_made_once(tmp_path, monkeypatch):
-    calls = []
-
-    def fake(folder, places, wild, on_view=None):
-        assert places == (1, 1)
-        assert wild.quiet
-        calls.append(folder)
-        folder.mkdir(parents=True)
-
-    monkeypatch.setattr(capture, "make_capture", fake)
-    monkeypatch.setenv("SAGESPLAT_CACHE", str(tmp_path / "cache"))
-    assert cached_capture() == cached_capture() == calls[0]
-    assert len(calls) == 1
-    assert calls[0].parents[1] == tmp_path / "cache"
-
-
 def test_a_stopped_run_leaves_nothing(tmp_path):
     def stop(done, views):
         assert views == 12
@@ -108,14 +83,3 @@ def test_a_stopped_run_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         small(tmp_path / "garden", stop)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_refusals(tmp_path):
-    (tmp_path / "there").mkdir()
-    with pytest.raises(SceneError, match="already exists"):
-        make_capture(tmp_path / "there")
-    with pytest.raises(SceneError, match="at least 3"):
-        make_capture(tmp_path / "few", views=2)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(SceneError, match="cannot be written"):
-        make_capture(tmp_path / "file" / "below")

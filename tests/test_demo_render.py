@@ -24,11 +24,6 @@ def rays_of(camera):
     return camera_rays(camera, np.stack([u, v], 1))
 
 
-def test_a_view_is_always_the_same(camera, view):
-    for first, again in zip(view, render_view(camera), strict=True):
-        np.testing.assert_array_equal(first, again)
-
-
 def test_depth_of_the_paving_is_that_of_the_plane(camera, view):
     _, label, depth = view
     origins, directions, z_share = rays_of(camera)

@@ -162,7 +162,7 @@ def test_error_messages_are_those_of_the_code():
     code = re.sub(r"\$?\{[^{}\n]*\}", "…", code)
     tables = "".join((DOCS / "help" / name).read_text() for name in ("errors.md", "troubleshooting.md"))
     messages = re.findall(r"^\| `(?!RUN|infeas|uncal|lift|unlab)([^`]{12,})` \|", tables, re.MULTILINE)
-    assert len(messages) > 25
+    assert len(messages) > 15
     for message in messages:
         for part in (part.strip(" .:;,()") for part in message.split("…")):
             assert part in code, f"{message}: no {part!r}"

@@ -277,26 +277,6 @@ def trained(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
-def test_training_goes_on_after_a_full_disk(scene: Scene, trained: Path, tmp_path, monkeypatch) -> None:
-    """Full after a random number of bytes, again and again: the result is that of an undisturbed one."""
-    chance, lines = random.Random(4), []
-    while True:
-        with space_for(chance.randrange(90_000), monkeypatch):
-            try:
-                list(training(scene, tmp_path))
-                break
-            except RunError as error:
-                lines.append(str(error))
-        assert temporary(tmp_path) == []
-        if len(lines) == 40:  # a disk that never has room for one checkpoint
-            list(training(scene, tmp_path))
-            break
-    assert len(lines) >= 5
-    assert all(re.search(FULL, line) for line in lines)
-    assert content(tmp_path) == content(trained)
-
-
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "capture"
@@ -340,9 +320,8 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(tmp_path: Path, kind: 
     assert damage.startswith(f"{path}: ")
     assert torch.equal(state.gaussians.means, state_at(20).gaussians.means)
     damaged(previous(path), kind)
-    with pytest.raises(RunError, match=r"checkpoint\.npz: .*, and .*checkpoint-1\.npz: .*; delete both") as e:
+    with pytest.raises(RunError, match=r"checkpoint\.npz: .*, and .*checkpoint-1\.npz: .*; delete both"):
         latest_checkpoint(path, "s")
-    assert "\n" not in str(e.value)
     remove_checkpoints(path)
     assert list(tmp_path.iterdir()) == []
 
@@ -431,9 +410,8 @@ def test_training_does_not_go_on_with_a_damaged_level(scene: Scene, trained: Pat
     level = tmp_path / "levels" / "000008.npz"
     damaged(level, "bit")
     message = r"000008\.npz: a damaged level .*; delete it to resume without that level, or .*checkpoint\.npz"
-    with pytest.raises(RunError, match=message) as caught:
+    with pytest.raises(RunError, match=message):
         list(training(scene, tmp_path))
-    assert "\n" not in str(caught.value)
     (tmp_path / "checkpoint.npz").unlink()
     list(training(scene, tmp_path))
     assert content(tmp_path) == content(trained)
@@ -474,17 +452,6 @@ def test_stages_are_refused_and_readers_are_not(finished: Path, capture: Path, t
         with pytest.raises(RunError, match="works on it; wait for it or stop it"):
             most_stages(again, capture, replace(CONFIG, plan=PlanConfig(target_ssim=0.5)))
     assert content(run) == content(finished)
-
-
-def test_too_little_memory_costs_no_levels(finished: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
-    job = Job(RunDir(run, "snapshots"), lambda event: None, force=True, memory_limit=2**20)
-    before = content(run / "levels")
-    with pytest.raises(RunError, match="raise --memory-limit"):
-        train_levels(job, replace(CONFIG.train, max_steps=99), 0)
-    assert content(run / "levels") == before
-    assert arrays(job.run.checkpoint).keys() == arrays(finished / "checkpoint.npz").keys()
 
 
 def test_a_job_may_keep_its_lock_between_stages(finished: Path, tmp_path: Path) -> None:

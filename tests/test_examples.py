@@ -15,7 +15,6 @@ import pytest
 from PIL import Image
 
 from sagesplat import read_ply
-from sagesplat.demo.capture import make_capture
 from tools.notebooks import NOTEBOOKS, execute
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -28,13 +27,6 @@ def run(name: str, *words: object) -> str:
         patch.setattr(sys, "argv", [str(script), *map(str, words)])
         runpy.run_path(str(script), run_name="__main__")
     return out.getvalue()
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=10, width=64, height=48)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -95,7 +95,6 @@ def test_archives_that_are_refused(tmp_path, monkeypatch):
         with pytest.raises(DataError, match=message) as caught:
             read_splat(zipped(tmp_path / "bad.zip", files))
         assert str(caught.value).startswith(f"{tmp_path / 'bad.zip'}: ")
-        assert "\n" not in str(caught.value)
     monkeypatch.setattr(archive, "_FREE", 2**16)
     with pytest.raises(DataError, match="unpacks to too much"):
         read_splat(zipped(tmp_path / "bomb.zip", {"a.ply": content + bytes(10**6)}))

@@ -112,9 +112,8 @@ def test_not_finite_is_refused(tmp_path, name):
     parameter = getattr(g, name).clone()
     parameter.view(30, -1)[7, 0] = float("inf")
     path = write_level(tmp_path, 3, replace(g, **{name: parameter}), recovering=False, sh_degree=3)
-    with pytest.raises(DataError, match=rf"000003\.npz: {name} holds NaN or Inf; delete") as caught:
+    with pytest.raises(DataError, match=rf"000003\.npz: {name} holds NaN or Inf; delete"):
         read_level(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_not_a_level(tmp_path):
@@ -123,9 +122,8 @@ def test_not_a_level(tmp_path):
     other.write_text("hello")
     np.savez(no_meta, **{"3/means": np.zeros((2, 3))})  # type: ignore[arg-type]
     for path in (missing, other, no_meta):
-        with pytest.raises(DataError, match=rf"{path.name}: not a") as caught:
+        with pytest.raises(DataError, match=rf"{path.name}: not a"):
             read_level(path)
-        assert "\n" not in str(caught.value)
 
 
 def test_harmonics_not_yet_in_use_are_left_out(tmp_path):

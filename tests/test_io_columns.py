@@ -39,4 +39,3 @@ def test_a_damaged_table_is_named(tmp_path, content):
     with pytest.raises(DataError, match="sagesplat evaluate") as caught:
         read_evaluation(path)
     assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)

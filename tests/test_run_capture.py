@@ -66,11 +66,8 @@ def test_a_photo_of_the_same_size_and_time_is_noticed(tmp_path: Path, capture: P
         lambda: begin(tmp_path / "run", capture),
         lambda: Job(RunDir(tmp_path / "run"), lambda event: None).scene,
     ):
-        with pytest.raises(
-            RunError, match=r"images/01\.png: not the photo that this run began with"
-        ) as caught:
+        with pytest.raises(RunError, match=r"images/01\.png: not the photo that this run began with"):
             act()
-        assert "\n" not in str(caught.value)
     assert any(isinstance(event, StageDone) for event in begin(tmp_path / "run", capture, force=True))
     assert Job(RunDir(tmp_path / "run"), lambda event: None).scene.views
     assert isinstance(begin(tmp_path / "run", capture)[-1], StageSkipped)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import SMALL_RUN
+from conftest import SMALL_RUN, job_of
 
 from sagesplat.cli import commands, parse
 from sagesplat.core.config import FitConfig
@@ -53,10 +53,6 @@ WHOLE = [
     b"", b"[]", b"7", b"null", b'"x"', b"{}", b"[" * 100_000, b"\xff\xfe", bytes(30), b"[[]]", b'{"a":',
 ]  # fmt: skip
 VARIANTS = 40  # of the values in a document, besides those of the whole
-
-
-def job_of(run: Path, force: bool = False) -> Job:
-    return Job(RunDir(run), lambda event: None, "cpu", force=force)
 
 
 def redone(stage: str, run: Path, act: Callable[[Job], Any]) -> None:
@@ -125,12 +121,6 @@ READERS = {  # the commands that read a document
     "levels/000006.npz": ("nest", "live"),
     "checkpoint.npz": ("train", "resume"),
 }
-
-
-@pytest.fixture
-def run(finished_run: Path, tmp_path: Path) -> Path:
-    (tmp_path / "capture").symlink_to(finished_run.parent / "capture")
-    return Path(shutil.copytree(finished_run, tmp_path / "run"))
 
 
 def nodes(document: Any, path: tuple = ()) -> Iterator[tuple]:
@@ -276,9 +266,8 @@ def test_documents_that_do_not_belong_to_the_others(
     assert old in text
     (run / name).write_text(text.replace(old, new))
     agree(run)
-    with pytest.raises(SageError, match=complaint) as caught:
+    with pytest.raises(SageError, match=complaint):
         COMMAND[command](run)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

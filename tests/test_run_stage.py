@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from conftest import job_of
 
 from sagesplat.core.config import (
     BlocksConfig,
@@ -22,7 +23,6 @@ from sagesplat.core.config import (
 )
 from sagesplat.core.errors import OutOfMemory, RunError
 from sagesplat.core.events import Event, Progress, StageDone
-from sagesplat.demo.capture import make_capture
 from sagesplat.io.files import read_json, write_json, write_text
 from sagesplat.run import stage
 from sagesplat.run.job import Job
@@ -48,13 +48,6 @@ CONFIG = RunConfig(
     plan=PlanConfig(target_ssim=0.4, other_targets=()),
 )
 BLOCKS = BlocksConfig(count=2)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=12, width=64, height=48)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +77,6 @@ def done(events: list[Event]) -> list[str]:
 def rows_of(table: Path) -> list[dict[str, str]]:
     with table.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def quiet(run: Path, **options) -> Job:
-    return Job(RunDir(run), lambda event: None, "cpu", **options)
 
 
 # every file that a stage reads
@@ -292,7 +281,7 @@ def test_a_moved_run_has_nothing_to_do(copy: Path, capture: Path) -> None:
 def test_a_run_folder_of_an_older_format_is_refused_by_every_stage(copy: Path, capture: Path) -> None:
     for path in copy.rglob("provenance/*.json"):
         write_json(path, read_json(path) | {"format": FORMAT - 1})
-    job = quiet(copy, force=True)
+    job = job_of(copy, force=True)
     shutil.rmtree(job.run.increments)  # their names were others
     older = rf"of format {FORMAT - 1}, this sagesplat \(.*\) reads {FORMAT}; run again into a new folder$"
     for act in (
@@ -332,11 +321,11 @@ def test_deleting_fused_label_images_is_noticed(copy: Path, capture: Path) -> No
 
 
 def test_other_label_images_are_noticed_though_points_keep_their_labels(copy: Path) -> None:
-    job = quiet(copy, force=True)
+    job = job_of(copy, force=True)
     before = job.run.labels.read_bytes()
     make_masks(job, CONFIG.masks, LabelsConfig(min_share=1e-9))
     assert job.run.labels.read_bytes() == before
-    job = quiet(copy)
+    job = job_of(copy)
     with pytest.raises(RunError, match=r"provenance/masks\.json \(its content changed\)"):
         nest_levels(job, CONFIG.nest, 0)
     record = job.run.provenance("observe").read_bytes()
@@ -347,7 +336,7 @@ def test_other_label_images_are_noticed_though_points_keep_their_labels(copy: Pa
 @pytest.mark.slow
 def test_early_stopping_depends_on_label_images_and_other_training_does_not(copy: Path) -> None:
     early = replace(CONFIG.train, freeze_at=0.5, sky="off")
-    job = quiet(copy, force=True)
+    job = job_of(copy, force=True)
     assert "provenance/masks.json" in read_json(job.run.provenance("train"))["inputs"]  # photos show some sky
     train_levels(job, replace(early, freeze_at=None), 0)
     assert "provenance/masks.json" not in read_json(job.run.provenance("train"))["inputs"]
@@ -355,7 +344,7 @@ def test_early_stopping_depends_on_label_images_and_other_training_does_not(copy
     assert "provenance/masks.json" in read_json(job.run.provenance("train"))["inputs"]
     make_masks(job, CONFIG.masks, LabelsConfig(min_share=1e-9))
     with pytest.raises(RunError, match=r"provenance/masks\.json \(its content changed\)"):
-        train_levels(quiet(copy), early, 0)
+        train_levels(job_of(copy), early, 0)
 
 
 @pytest.mark.slow
@@ -421,12 +410,12 @@ def test_a_killed_nest_does_not_resume_with_other_labels_or_another_base_model(
     killed_in_nest(copy, CONFIG.nest)
     assert run.nest_checkpoint.exists()
     if change == "fuse":
-        fuse_masks(quiet(copy))
+        fuse_masks(job_of(copy))
     else:
         shutil.copy(copy / "levels" / "000010.npz", run.base_model)
     with pytest.raises(RunError, match=r"checkpoint\.npz: made with other settings or inputs; delete .*"):
-        nest_levels(quiet(copy), CONFIG.nest, 0)
-    nest_levels(quiet(copy, force=True), CONFIG.nest, 0)
+        nest_levels(job_of(copy), CONFIG.nest, 0)
+    nest_levels(job_of(copy, force=True), CONFIG.nest, 0)
     assert not run.nest_checkpoint.exists()
 
 
@@ -450,11 +439,11 @@ def test_a_killed_nest_resumes_with_the_same_inputs(copy: Path, finished: Path, 
 
 def test_models_are_fitted_to_what_was_observed(copy: Path) -> None:
     other = replace(CONFIG.fit, distance="minimum")
-    observe_levels(quiet(copy, force=True), other)
+    observe_levels(job_of(copy, force=True), other)
     with pytest.raises(RunError, match=r"observed with distance minimum; add --fit\.distance minimum"):
-        fit_ladder(quiet(copy, force=True), CONFIG.fit)
-    fit_ladder(quiet(copy, force=True), other)
-    assert quiet(copy).fit_config.distance == "minimum"
+        fit_ladder(job_of(copy, force=True), CONFIG.fit)
+    fit_ladder(job_of(copy, force=True), other)
+    assert job_of(copy).fit_config.distance == "minimum"
 
 
 def test_a_folder_of_any_names_has_a_hash(tmp_path: Path) -> None:

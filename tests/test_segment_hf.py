@@ -264,7 +264,6 @@ def test_unusable_networks(
     for model, complaint in cases:
         with pytest.raises(LabelError, match=complaint) as caught:
             HfSegmenter(model, device="cpu")
-        assert "\n" not in str(caught.value)
         assert str(model) in str(caught.value)
     assert capfd.readouterr() == ("", "")
 
@@ -322,6 +321,5 @@ def test_queries_that_others_hide_are_no_instances() -> None:
 
 def test_photos_no_network_can_take(folders: dict[str, Path]) -> None:
     segmenter = HfSegmenter(folders["eomt"], device="cpu")
-    with pytest.raises(LabelError, match="cannot take a photo of 300 x 1 pixels") as caught:
+    with pytest.raises(LabelError, match="cannot take a photo of 300 x 1 pixels"):
         segmenter([noise(1, 300)])
-    assert "\n" not in str(caught.value)

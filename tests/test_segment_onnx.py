@@ -166,9 +166,8 @@ def test_input_and_output_are_resampled_bilinearly(tmp_path):
 def test_unusable_classes(tmp_path, content, complaint):
     if content is not None:
         (tmp_path / "c.json").write_text(json.dumps(content))
-    with pytest.raises(LabelError, match=complaint) as caught:
+    with pytest.raises(LabelError, match=complaint):
         read_classes(tmp_path / "c.json")
-    assert "\n" not in str(caught.value)
 
 
 def test_unusable_models(tmp_path, files):
@@ -182,7 +181,6 @@ def test_unusable_models(tmp_path, files):
     for path, complaint in cases:
         with pytest.raises(LabelError, match=complaint) as caught:
             OnnxSegmenter(path, classes)([red_and_blue()])
-        assert "\n" not in str(caught.value)
         assert str(path) in str(caught.value)
 
 
@@ -213,9 +211,8 @@ LOGITS = ("logits", (1, 3, 16, 32), FLOAT)
 )
 def test_outputs_that_are_no_label_scores(tmp_path, files, nodes, output):
     model = model_of(tmp_path / "m.onnx", nodes, outputs=[output] if output else [])
-    with pytest.raises(LabelError, match=r"m\.onnx: ") as caught:
+    with pytest.raises(LabelError, match=r"m\.onnx: "):
         OnnxSegmenter(model, files[1])([red_and_blue()])
-    assert "\n" not in str(caught.value)
 
 
 def test_an_output_too_large_is_refused_before_it_is_made(tmp_path, files):
@@ -259,9 +256,8 @@ def test_weights_outside_of_the_models_folder_are_not_read(tmp_path, files, loca
         (folder / "w.bin").write_bytes((tmp_path / "w.bin").read_bytes())
         assert OnnxSegmenter(model, files[1])([red_and_blue()])
         return
-    with pytest.raises(LabelError, match=r"m\.onnx: no model that onnxruntime can load") as caught:
+    with pytest.raises(LabelError, match=r"m\.onnx: no model that onnxruntime can load"):
         OnnxSegmenter(model, files[1])
-    assert "\n" not in str(caught.value)
 
 
 def test_without_onnxruntime(tmp_path, monkeypatch):
@@ -286,12 +282,6 @@ def test_real_networks_on_a_real_photo(name):
         assert (found[given == label_id] == label_id).mean() > least
 
 
-def test_a_network_that_overflows(tmp_path, files):
-    model = write_model(tmp_path / "m.onnx", np.full((3, 3), np.inf))
-    with pytest.raises(LabelError, match="not finite"):
-        OnnxSegmenter(model, files[1])([red_and_blue()])
-
-
 @pytest.mark.parametrize(
     ("shape", "kind"),
     [
@@ -313,18 +303,4 @@ def test_inputs_that_are_no_photo(tmp_path, files, shape, kind):
     model = model_of(tmp_path / "m.onnx", nodes, [("photo", shape, kind)], [("logits", shape, kind)])
     with pytest.raises(LabelError, match=r"m\.onnx: .*export it") as caught:
         OnnxSegmenter(model, files[1])
-    assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 1000
-
-
-def test_models_without_inputs_or_with_two(tmp_path, files):
-    one = field(5, field(1, 1) + field(2, FLOAT) + field(8, "one") + field(9, struct.pack("<f", 1)))
-    two = [("photo", (1, 3, 16, 32), FLOAT), ("other", (1, 3, 16, 32), FLOAT)]
-    cases = [
-        ("0 inputs", node("Identity", ["one"], "logits"), (), [("logits", (1,), FLOAT)], one),
-        ("2 inputs", node("Add", ["photo", "other"], "logits"), two, [LOGITS], b""),
-    ]
-    for complaint, nodes, inputs, outputs, tensors in cases:
-        model = model_of(tmp_path / "m.onnx", nodes, inputs, outputs, tensors)
-        with pytest.raises(LabelError, match=complaint):
-            OnnxSegmenter(model, files[1])

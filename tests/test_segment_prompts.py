@@ -30,7 +30,6 @@ def test_prompts_are_separated_by_semicolons() -> None:
 def test_prompts_that_cannot_be(text: str, complaint: str) -> None:
     with pytest.raises(LabelError, match=complaint) as caught:
         parse_prompts(text)
-    assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500
 
 

@@ -121,9 +121,8 @@ def test_networks_of_the_wrong_kind(folders: dict[str, str], tmp_path: Path) -> 
     ]
     for model, masks, complaint in cases:
         config = MasksConfig(segmenter="text", prompts="ivy", model=model, mask_model=masks)
-        with pytest.raises(LabelError, match=complaint) as caught:
+        with pytest.raises(LabelError, match=complaint):
             load_text(config, "cpu", 1, [].append, {})
-        assert "\n" not in str(caught.value)
 
 
 def test_what_the_answers_depend_on(tmp_path: Path) -> None:
@@ -158,7 +157,6 @@ def test_settings_that_cannot_be(config: MasksConfig, complaint: str) -> None:
     with pytest.raises(SageError, match=complaint) as caught:
         SEGMENTERS["text"].settings(config)
     assert isinstance(caught.value, RunError | LabelError)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_usual_threshold_is_the_family_s(folders: dict[str, str]) -> None:

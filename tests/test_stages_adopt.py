@@ -20,7 +20,7 @@ from sagesplat.core.config import (
     SampleConfig,
     SceneConfig,
 )
-from sagesplat.core.errors import DataError, RunError, SageError
+from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_index
@@ -145,18 +145,6 @@ def test_it_bundles(adopted: Path, tmp_path: Path) -> None:
 def test_a_second_call_does_nothing(adopted: Path) -> None:
     _, events = _adopt(adopted.parent, adopted.parent / "ball.ply", SMALL)
     assert not [event for event in events if isinstance(event, StageDone)]
-
-
-def test_levels_that_were_made_as_spz_files_are_made_again_with_force(adopted: Path) -> None:
-    record = RunDir(adopted).provenance("nest")
-    before = record.read_text()
-    old = json.loads(before)
-    del old["settings"]["increments"]
-    record.write_text(json.dumps(old))
-    job = Job(RunDir(adopted), lambda event: None, "cpu")
-    with pytest.raises(RunError, match=r"ladder\.npz: made with other .*increments.*--force"):
-        make_levels(job, SMALL)
-    record.write_text(before)
 
 
 def test_levels_are_a_file_of_streams_for_each_category(adopted: Path) -> None:
@@ -286,17 +274,3 @@ def test_one_gaussian(tmp_path: Path) -> None:
     write_ply(tmp_path / "few.ply", replace(g, label_ids=torch.full_like(g.label_ids, -1)))
     job, _ = _levels(tmp_path, tmp_path / "few.ply", SMALL)
     assert job.ladder.size(job.ladder.levels[-1]) == 1
-
-
-def test_errors_are_one_line(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no-such"):
-        _levels(tmp_path, tmp_path / "no-such.ply", SMALL)
-    (tmp_path / "text.ply").write_text("nothing of the kind")
-    with pytest.raises(DataError, match=r"text\.ply"):
-        _levels(tmp_path, tmp_path / "text.ply", SMALL)
-    write_ply(tmp_path / "ball.ply", _ball())
-    for config in (replace(SMALL, up="sideways"), replace(SMALL, cameras=tmp_path / "no-such.json")):
-        with pytest.raises(SageError) as error:
-            _levels(tmp_path, tmp_path / "ball.ply", config)
-        assert "\n" not in str(error.value)
-    assert not (tmp_path / "run" / "levels").exists()

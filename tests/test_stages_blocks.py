@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import random_gaussians, write_capture
+from conftest import job_of, random_gaussians
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_run_executor import Shuffled
@@ -32,7 +32,7 @@ from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.demo.capture import make_capture
 from sagesplat.formats.label_edits import Hide, LabelEdits, Merge, dump_edits, ladder_hash
 from sagesplat.formats.levels import write_set
-from sagesplat.io.files import read_json, write_text
+from sagesplat.io.files import read_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene import load_scene
@@ -170,11 +170,6 @@ def test_a_part_keeps_its_points_and_some_of_the_background(monkeypatch: pytest.
         training_scene(scene, blocks, mine, [], seed=0)
 
 
-def test_impossible_numbers_of_blocks() -> None:
-    with pytest.raises(RunError, match=r"blocks of .* are impossible; choose fewer with --blocks\.count"):
-        split(street(), 500)
-
-
 def test_partition_reads_back(tmp_path: Path) -> None:
     blocks = split(street(), 5)
     write_blocks(tmp_path / "blocks.json", blocks, views=[1, 2])
@@ -290,17 +285,6 @@ CONFIG = RunConfig(
 )
 
 
-def job_of(path: Path, *, force: bool = False) -> Job:
-    return Job(RunDir(path), lambda _: None, "cpu", force=force)
-
-
-def a_viewer(folder: Path) -> Path:
-    """A page in place of the built viewer."""
-    (folder / "viewer").mkdir()
-    write_text(folder / "viewer" / "index.html", "<!-- pack --><!-- poster -->")
-    return folder / "viewer"
-
-
 def run_in_blocks(capture: Path, run: Path, config: RunConfig = CONFIG, **options) -> list[Event]:
     events: list[Event] = []
     run_all(Job(RunDir(run, config.ladder), events.append, "cpu", **options), capture, config)
@@ -387,7 +371,7 @@ def test_blocks_are_the_same_in_any_order_and_process(finished: Path, capture: P
 
 
 @pytest.mark.slow
-def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
+def test_instances_of_blocks(finished: Path, tmp_path: Path, viewer: Path) -> None:
     path = tmp_path / "run"
     shutil.copytree(finished, path)
     before = job_of(path).names()
@@ -415,7 +399,7 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
     assert {("potted plant", "potted plant 1"), (None, "dining table")} <= tree
     # snapshots have no instances, and they can be folded back
     assert Job(RunDir(path, "snapshots"), print).names() == before
-    assert live_bundle(job_of(path), tmp_path / "live", a_viewer(tmp_path))
+    assert live_bundle(job_of(path), tmp_path / "live", viewer)
     live = read_json(tmp_path / "live" / "manifest.json")["labels"]
     assert {(one["id"], one["name"]) for one in live} <= set(before.items())
     make_instances(job_of(path, force=True), MasksConfig(), LabelsConfig())
@@ -423,14 +407,14 @@ def test_instances_of_blocks(finished: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_categories_of_blocks_can_be_edited(finished: Path, tmp_path: Path) -> None:
+def test_categories_of_blocks_can_be_edited(finished: Path, tmp_path: Path, viewer: Path) -> None:
     job = job_of(finished)
     ids = {name: label for label, name in job.names().items()}
     edits = (Hide("dining table", True), Merge("vase", "potted plant"))
     (tmp_path / "labels.edit.json").write_bytes(
         dump_edits(LabelEdits(ladder_hash(increments_of(job), job.names()), edits))
     )
-    made = apply_labels(job, tmp_path / "labels.edit.json", tmp_path / "out", viewer=a_viewer(tmp_path))
+    made = apply_labels(job, tmp_path / "labels.edit.json", tmp_path / "out", viewer=viewer)
     labels = {one["name"]: one for one in read_json(made.bundle.path / "manifest.json")["labels"]}
     assert labels["dining table"]["hidden"]
     before = [label for label in job.cells.labels if label in (ids["vase"], ids["potted plant"])]
@@ -452,13 +436,3 @@ def test_snapshots_of_blocks(capture: Path, tmp_path: Path) -> None:
     events = run_in_blocks(capture, tmp_path / "run", config)
     assert any(isinstance(e, StageDone) and e.name == "report" for e in events)
     assert read_json(RunDir(tmp_path / "run", "snapshots").plan)["scene"]
-
-
-def test_stored_scenes_name_photos_that_may_be(tmp_path: Path) -> None:
-    scene = write_capture(tmp_path / "capture", random_gaussians(12))
-    views = (replace(scene.views[0], name="caf\udce9.png"), *scene.views[1:])
-    write_scene(tmp_path / "a.npz", replace(scene, views=views))
-    with pytest.raises(SceneError, match=r"not a stored scene \(views\[0\]: it is not UTF-8"):
-        read_scene(tmp_path / "a.npz")
-    write_scene(tmp_path / "b.npz", replace(scene, name="\x1b[31m"))
-    assert read_scene(tmp_path / "b.npz").name == "_[31m"

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import job_of
 from PIL import Image
 from test_viewer_bundle import manifest_of, own_views
 
@@ -18,11 +19,10 @@ from sagesplat.core.errors import DataError, RunError
 from sagesplat.formats.increments import read_increments, read_index, write_increments
 from sagesplat.formats.levels import write_set
 from sagesplat.formats.spz import read_spz
-from sagesplat.io.files import read_json, write_json
+from sagesplat.io.files import read_json, write_json, write_text
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.records import FORMAT, input_hashes
-from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.display_colors import colors_of
 from sagesplat.stages.bundle import BundleMade, bundle
 from sagesplat.stages.export import increment_files
@@ -40,28 +40,6 @@ from sagesplat.viewer.promises import allowed_change
 from sagesplat.viewer.sent_model import read_fidelity, read_model
 
 
-def job_of(run: Path) -> Job:
-    return Job(RunDir(run), lambda event: None)
-
-
-@pytest.fixture
-def run(finished_run: Path, tmp_path: Path) -> Path:
-    """A copy of a finished run, to change."""
-    return Path(shutil.copytree(finished_run, tmp_path / "run"))
-
-
-def write_page(folder: Path) -> Path:
-    """A folder with a page in place of the built viewer."""
-    folder.mkdir()
-    (folder / "index.html").write_text("<!doctype html><body><!-- poster --></body>")
-    return folder
-
-
-@pytest.fixture
-def viewer(tmp_path: Path) -> Path:
-    return write_page(tmp_path / "viewer")
-
-
 def approve(job: Job) -> None:
     """Record that the run's models were fitted to its increments as they are now."""
     record = job.run.path / "nested" / "provenance" / "fit.json"
@@ -74,8 +52,9 @@ def approve(job: Job) -> None:
 def bundled(finished_run: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, BundleMade]:
     """The bundle of a run, with settings of its own for cars."""
     folder, job = tmp_path_factory.mktemp("bundled"), job_of(finished_run)
-    page = write_page(folder / "viewer")
-    made = bundle(job, folder / "out", meters_per_unit=2.0, always=["car"], weights={"car": 3}, viewer=page)
+    write_text(folder / "viewer" / "index.html", "<body><!-- poster --></body>")
+    settings = {"meters_per_unit": 2.0, "always": ["car"], "weights": {"car": 3}}
+    made = bundle(job, folder / "out", viewer=folder / "viewer", **settings)
     return job, made
 
 
@@ -188,9 +167,8 @@ def test_a_finished_run_is_shown_without_its_capture(run: Path, tmp_path: Path, 
 def test_an_unfinished_run_names_the_command(run, tmp_path, viewer, missing, command) -> None:
     path = run / missing
     shutil.rmtree(path) if path.is_dir() else path.unlink()
-    with pytest.raises(RunError, match=rf"finished nested ladder: run `sagesplat {command}`") as caught:
+    with pytest.raises(RunError, match=rf"finished nested ladder: run `sagesplat {command}`"):
         bundle(job_of(run), tmp_path / "out", viewer=viewer)
-    assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
@@ -293,15 +271,6 @@ def test_a_live_bundle_follows_the_training(run: Path, tmp_path: Path, viewer: P
     assert there >= uris[1] | uris[2]
     assert not there & (uris[0] - uris[1] - uris[2])
     assert not (folder / ".chunks").exists()
-
-
-def test_a_live_bundle_leaves_other_folders_alone(run: Path, tmp_path: Path, viewer: Path) -> None:
-    other = tmp_path / "photos"
-    other.mkdir()
-    (other / "a.jpg").write_text("x")
-    with pytest.raises(RunError, match="neither empty nor a bundle"):
-        live_bundle(job_of(run), other, viewer)
-    assert [path.name for path in other.iterdir()] == ["a.jpg"]
 
 
 def test_a_live_bundle_that_was_killed_before_its_manifest_goes_on(

@@ -1,6 +1,5 @@
 """Floaters go from the last level, which is kept as it was trained."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,9 +21,8 @@ from sagesplat.stages.clean import clean_levels, clean_lines, read_clean_figures
 
 
 @pytest.fixture
-def run(finished_run: Path, tmp_path: Path) -> RunDir:
-    shutil.copytree(finished_run, tmp_path / "run")
-    return RunDir(tmp_path / "run")
+def run(run: Path) -> RunDir:
+    return RunDir(run)
 
 
 def job_of(run: RunDir, events: list[Event] | None = None, *, force: bool = False) -> Job:

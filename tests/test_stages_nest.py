@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import DemoRun, pinhole, random_gaussians, write_capture
+from conftest import DemoRun, job_of, pinhole, random_gaussians, write_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -327,12 +327,8 @@ def finished(demo_run: DemoRun) -> Path:
     return demo_run.path
 
 
-def quiet(run: Path, **options) -> Job:
-    return Job(RunDir(run), lambda event: None, **options)
-
-
 def test_a_run_makes_a_nested_ladder_by_default(finished: Path) -> None:
-    job = quiet(finished)
+    job = job_of(finished)
     table = read_observations(job.run.observations)
     assert set(table.level) == {1, 2, 3, 4, 5}
     whole = table.select((table.label_id == TOTAL) & np.isin(table.view, job.scene.train_ids))
@@ -370,7 +366,7 @@ def test_the_papers_ladder_has_no_budget(finished: Path) -> None:
 
 def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "run")
-    job = quiet(tmp_path / "run", force=True)
+    job = job_of(tmp_path / "run", force=True)
     full = NestedLevels(job).costs
     for unit in ("bytes", "gpu-bytes", "count"):
         costs, promised = full.of(unit), []
@@ -409,7 +405,7 @@ def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: 
 
 def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "run")
-    job = quiet(tmp_path / "run")
+    job = job_of(tmp_path / "run")
     cross_views(job)
     table = read_cross_view(job.run.cross_view)
     parts = table.select((table.label_id != TOTAL) & np.isfinite(table.predicted))
@@ -429,7 +425,7 @@ def test_each_view_is_planned_by_its_bound(finished: Path, tmp_path: Path) -> No
 
 
 def test_coverage_is_tested_on_the_plans_that_are_made_and_costs_are_bytes(finished: Path) -> None:
-    job, target = quiet(finished), 0.4
+    job, target = job_of(finished), 0.4
     nested = NestedLevels(job)
     scores = nested.coverage([target])
     assert scores is not None
@@ -453,7 +449,7 @@ def test_coverage_is_tested_on_the_plans_that_are_made_and_costs_are_bytes(finis
 @pytest.mark.slow
 def test_without_calibration_views_a_run_still_promises(demo_run: DemoRun, tmp_path: Path) -> None:
     config = replace(demo_run.config, scene=SceneConfig(calibrate_every=0), train=TrainConfig(max_steps=20))
-    job = quiet(tmp_path / "run")
+    job = job_of(tmp_path / "run")
     run_all(job, demo_run.capture, replace(config, nest=replace(QUICK, steps=2, base_share=0.0)))
     assert read_plans(job.run.plan)[0]
 
@@ -478,7 +474,7 @@ def test_seeds_come_first_and_take_the_place_of_the_least_worthy(scene: Scene) -
 
 
 def test_export_writes_what_other_viewers_read(finished: Path, tmp_path: Path) -> None:
-    job, options = quiet(finished), {"level": 3, "labels": [], "target": None}
+    job, options = job_of(finished), {"level": 3, "labels": [], "target": None}
     expected = job.ladder.load(3)
     for name in ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat"):
         assert export_scene(job, tmp_path / name, **options) == len(expected)
@@ -494,7 +490,7 @@ def test_export_writes_what_other_viewers_read(finished: Path, tmp_path: Path) -
 
 
 def test_export_writes_levels_of_detail(finished: Path, tmp_path: Path) -> None:
-    job, options = quiet(finished), {"level": None, "labels": [], "target": None}
+    job, options = job_of(finished), {"level": None, "labels": [], "target": None}
     path = tmp_path / "lods" / "lod-meta.json"
     assert export_scene(job, path, **options) == len(job.ladder.load(5))
     counts = [len(read_splat(path, lod).gaussians) for lod in range(num_lods(path))]

@@ -1,11 +1,11 @@
 """What a run noticed is told at its end: on the console and in the report."""
 
 import io
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import job_of
 from PIL import Image
 from rich.console import Console as RichConsole
 
@@ -14,7 +14,6 @@ from sagesplat.core.events import Event, RunDone
 from sagesplat.io.files import write_json
 from sagesplat.output.report_data import ReportData
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.masks import mask_path
 from sagesplat.stages import report
 from sagesplat.stages.noticed import noticed
@@ -39,11 +38,10 @@ WORDS = (
 
 
 @pytest.fixture
-def job(finished_run: Path, tmp_path: Path) -> Job:
-    shutil.copytree(finished_run, tmp_path / "run")
+def job(run: Path) -> Job:
     for name in ("floaters.json", "floaters.png"):
-        (tmp_path / "run" / name).unlink(missing_ok=True)
-    return Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+        (run / name).unlink(missing_ok=True)
+    return job_of(run)
 
 
 def disturb(job: Job) -> None:

@@ -1,18 +1,16 @@
 """Outlier masks of a finished training: written, used by what is fitted afterwards, and removed again."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import SMALL_RUN
+from conftest import SMALL_RUN, job_of
 from PIL import Image
 
 from sagesplat.adapt.observe import render_rgb
 from sagesplat.core.config import TrainConfig
 from sagesplat.run.job import Job
-from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.masks import mask_path
 from sagesplat.segment.valid import ValidPixels, write_view
 from sagesplat.stages import compose
@@ -25,10 +23,9 @@ ON, OFF = TrainConfig(outliers=True), TrainConfig()
 
 
 @pytest.fixture
-def job(finished_run: Path, tmp_path: Path) -> Job:
+def job(run: Path) -> Job:
     """A run on photos of its own model, with a figure in the training view 1 and the test view 0."""
-    shutil.copytree(finished_run, tmp_path / "run")
-    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+    job = job_of(run)
     scene, g = job.scene, job.load_last_level()
     assert 0 in scene.test_ids
     assert 1 in scene.train_ids
@@ -75,9 +72,8 @@ def test_photos_without_outliers_are_said_to_have_none(job: Job):
     assert not list(job.run.inliers.iterdir())
 
 
-def test_another_training_has_masks_of_its_own_or_none(finished_run: Path, tmp_path: Path):
-    shutil.copytree(finished_run, tmp_path / "run")
-    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu", force=True)
+def test_another_training_has_masks_of_its_own_or_none(run: Path):
+    job = job_of(run, force=True)
     config = replace(SMALL_RUN.train, max_steps=4, level_every=4)
     for outliers in (True, False, True):
         train_levels(job, replace(config, outliers=outliers), 0)

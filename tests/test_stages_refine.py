@@ -8,13 +8,11 @@ import pytest
 from conftest import SMALL_RUN
 
 from sagesplat.core.config import BlocksConfig
-from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone
 from sagesplat.run.job import Job
 from sagesplat.run.records import uses
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.refined import read_refined
-from sagesplat.stages import blocks
 from sagesplat.stages.block_levels import nest_scene
 from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.observe import observe_levels
@@ -76,9 +74,3 @@ def test_a_run_that_ended_before_they_were_written_writes_them(refined, tmp_path
     after = read_refined(run.cameras, 8)
     assert np.array_equal(before.w2c, after.w2c)
     assert np.array_equal(before.fitted, after.fitted)
-
-
-def test_poses_and_blocks_are_refused():
-    with pytest.raises(RunError, match=r"--train\.poses does not go with --blocks\.count; leave out one"):
-        blocks.check(BlocksConfig(count=2), POSES)
-    blocks.check(BlocksConfig(), POSES)

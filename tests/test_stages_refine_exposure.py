@@ -9,14 +9,12 @@ from conftest import SMALL_RUN, random_gaussians, write_capture
 from PIL import Image
 
 from sagesplat.adapt.viewpoints import capture_cameras
-from sagesplat.core.config import BlocksConfig, RunConfig
-from sagesplat.core.errors import RunError
+from sagesplat.core.config import BlocksConfig
 from sagesplat.core.events import StageDone, Warned
 from sagesplat.io.files import write_json
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.refined import read_refined
-from sagesplat.stages import blocks
 from sagesplat.stages.blocks import train_scene
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.refine import read_refined_figures
@@ -88,10 +86,3 @@ def test_switched_off_nothing_is_left(run, tmp_path):
     assert not job.run.cameras.exists()
     assert not job.run.refined.exists()
     assert job.scene is job.given_scene
-
-
-def test_blocks_refuse_it():
-    config = replace(RunConfig().train, exposure="affine")
-    with pytest.raises(RunError, match=r"--train\.exposure affine does not go with --blocks.count"):
-        blocks.check(BlocksConfig(count=2), config)
-    blocks.check(BlocksConfig(count=2), RunConfig().train)

@@ -1,13 +1,13 @@
 """The stage `sample`, and the fidelity models that are fitted to it, on a run made in two seconds."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import job_of
 
 from sagesplat.adapt.cell_models import expect, promised
 from sagesplat.adapt.fidelity import measure_compositions, measure_levels
@@ -29,9 +29,8 @@ FEW = SampleConfig(views=6, calibration_views=4)
 
 
 @pytest.fixture
-def job(finished_run: Path, tmp_path: Path) -> Job:
-    shutil.copytree(finished_run, tmp_path / "run")
-    return Job(RunDir(tmp_path / "run"), lambda event: None, "cpu", force=True)
+def job(run: Path) -> Job:
+    return job_of(run, force=True)
 
 
 def again(job: Job, config: SampleConfig = FEW) -> list:

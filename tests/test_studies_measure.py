@@ -1,7 +1,6 @@
 """Levels of anybody against their scene: files, streamed SOG, bundles and runs; tables, picture and files."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,10 @@ from conftest import orbit, random_gaussians
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
 from sagesplat.core.config import MeasureConfig
-from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Event, TableMade, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_increments, read_index, shown
 from sagesplat.formats.ply import write_ply
-from sagesplat.metrics import flip
 from sagesplat.metrics.flip import flip_map
 from sagesplat.metrics.image import psnr, ssim_map
 from sagesplat.metrics.ms_ssim import ms_ssim
@@ -111,16 +108,6 @@ def test_flip_is_measured_where_it_is(files):
     assert level["FLIP"] < 1e-3
 
 
-def test_without_flip_one_line_says_so(files, monkeypatch):
-    monkeypatch.setattr(flip, "find_spec", lambda name: None)
-    events: list[Event] = []
-    found = measure([files / "full.ply", files / "third.ply"], files / "out", settings(files), events.append)
-    assert found.others == ["MS-SSIM"]
-    (line,) = [e.text for e in events if isinstance(e, Warned) and "FLIP" in e.text]
-    assert line.startswith("no FLIP: flip-evaluator is not installed; ")
-    assert "sagesplat[flip]" in line
-
-
 def test_an_empty_background_does_not_count_as_covered(files):
     found = measure([files / "full.ply", files / "third.ply"], files / "out", settings(files), ignore)
     for whole, covered in zip(found.of(0, TOTAL), found.of(0, COVERED), strict=True):
@@ -197,16 +184,6 @@ def test_levels_that_do_not_fit_into_memory_together(files, monkeypatch):
     assert together.of(1, TOTAL) == alone.of(1, TOTAL)
 
 
-def test_cameras_of_another_scene(files):
-    away = [
-        replace(camera, w2c=camera.w2c @ np.diag([-1, 1, -1, 1]).astype(np.float32)) for camera in orbit(2)
-    ]
-    write_viewpoints(files / "away.json", Viewpoints(Rule(), "capture", 50.0, tuple(away), ("fit",) * 2))
-    config = settings(files, cameras=files / "away.json")
-    with pytest.raises(RunError, match=r"away\.json: no camera has full\.ply in sight; give cameras of this"):
-        measure([files / "full.ply", files / "third.ply"], files / "out", config, ignore)
-
-
 def test_the_command(files, monkeypatch, command):
     monkeypatch.chdir(files)
     weights = ["--lpips", "none", "--threads", "1"]
@@ -216,24 +193,3 @@ def test_the_command(files, monkeypatch, command):
     code, _ = command("measure", *words)
     assert code == 0
     assert (files / "measure" / "levels.csv").is_file()
-
-
-CHUNK = {"uri": "chunks/a.spz", "count": 3, "bytes": 9, "gpuBytes": 9, "sha256": "0" * 64}
-LABEL = {"id": 3, "title": "car", "cells": [{"id": 0, "levels": [CHUNK]}]}
-
-
-@pytest.mark.parametrize(
-    "labels",
-    [
-        *(4, [], [LABEL | {"id": "x"}], [LABEL | {"cells": [4]}]),
-        *(
-            [LABEL | {"cells": [{"id": 0, "levels": [CHUNK | change]}]}]
-            for change in ({"uri": "chunks/../a"}, {"count": -1})
-        ),
-    ],
-)
-def test_damaged_bundles_are_one_line(tmp_path, labels):
-    document = {"format": "sagesplat-bundle", "labels": labels}
-    (tmp_path / "manifest.json").write_text(json.dumps(document))
-    with pytest.raises(DataError, match="make it again with `sagesplat bundle`"):
-        levels_of(tmp_path)

@@ -17,12 +17,10 @@ from sagesplat.core.config import (
     PlanConfig,
     RunConfig,
     SampleConfig,
-    SceneConfig,
     TrainConfig,
 )
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageSkipped, Warned
-from sagesplat.demo.capture import make_capture
 from sagesplat.formats.levels import write_level
 from sagesplat.io.files import read_json
 from sagesplat.output import tables
@@ -50,13 +48,6 @@ CONFIG = RunConfig(
     sample=SampleConfig(views=8, calibration_views=8),
 )
 PAPER = PaperConfig(tune_steps=5)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("demo") / "capture"
-    make_capture(folder, views=12, width=64, height=48)
-    return folder
 
 
 def work(run: Path, capture: Path, config: RunConfig = CONFIG, **options) -> tuple[Job, list[Event]]:
@@ -205,16 +196,6 @@ def test_a_second_report_has_nothing_to_do_and_another_view_needs_force(finished
         paper_report(again, replace(PAPER, view="nothing"))
     with pytest.raises(RunError, match=r"same_size\.csv: made with other .*--force"):
         paper_report(again, replace(PAPER, lpips=job.run.path / "nowhere", view=job.scene.views[3].name))
-
-
-@pytest.mark.slow
-def test_a_capture_without_test_views(capture, tmp_path):
-    config = replace(CONFIG, scene=SceneConfig(test_every=0), train=TrainConfig(max_steps=20, level_every=10))
-    job, _ = work(tmp_path / "run", capture, config)
-    paper_report(job, replace(PAPER, lpips=tmp_path, tune_steps=0))
-    assert not (job.run.paper / "table_1_test.csv").exists()
-    assert not (job.run.paper / "cross_view.csv").exists()
-    assert set(read_same_size(job.run.same_size).of_view) == {6}
 
 
 def test_early_stopping_beside_a_composition(capture, finished, tmp_path):

@@ -2,7 +2,6 @@
 
 import csv
 import math
-import shutil
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -16,7 +15,6 @@ from sagesplat.adapt.eq1 import choose_latest, plan_view
 from sagesplat.adapt.eq3 import Eq3, SsimModel, write_models
 from sagesplat.adapt.observe import Observations
 from sagesplat.core.config import SceneConfig
-from sagesplat.core.errors import RunError
 from sagesplat.formats.levels import write_level
 from sagesplat.run.job import Job
 from sagesplat.run.records import record
@@ -24,7 +22,6 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.stages.scene import open_scene
-from sagesplat.studies.transfer.report import headline, summary_table, transfer_figure
 from sagesplat.studies.transfer.run import load_fitted
 from sagesplat.studies.transfer.run import transfer as transfer_runs
 from sagesplat.studies.transfer.score import (
@@ -35,7 +32,6 @@ from sagesplat.studies.transfer.score import (
     score,
     shared_categories,
     transfer,
-    transferred_levels,
 )
 
 VIEWS = 16
@@ -136,15 +132,6 @@ def test_names_decide_not_ids():
     assert errors(scores)["extent"] < 1e-6
 
 
-def test_nothing_shared_is_one_line():
-    message = r"^runs/b: shares no category \(car\) with runs/a \(apple, bench\); choose [^\n]*$"
-    b = synthetic("runs/b", {1: "car", -1: "unlabelled"})
-    with pytest.raises(RunError, match=message):
-        transfer(synthetic("runs/a", {**A.names, -1: "unlabelled"}), b, TARGETS)
-    with pytest.raises(RunError, match="shares no category"):  # A never saw enough of it to have a model
-        transfer(replace(A, models={}), A, TARGETS)
-
-
 def test_levels_are_matched_by_their_share_of_the_run():
     b = replace(synthetic("b", A.names, levels=(30, 60, 90, 150)), recovering=frozenset({60}))
     matched = shared_categories(A, b)[0]
@@ -152,48 +139,6 @@ def test_levels_are_matched_by_their_share_of_the_run():
     resetting = replace(A, recovering=frozenset({200}))  # 90 of 150 is nearer to 300 of 300 than to 100
     assert shared_categories(resetting, b)[0].matched == (100, 100, 300)
     assert shared_categories(replace(A, recovering=frozenset(LEVELS)), b)[0].matched == (100, 200, 300)
-
-
-def test_a_category_without_test_views_and_one_in_two_views():
-    rows = A.observations
-    no_test = A.test_views[:, None] == rows.view
-    few = np.isin(rows.view, (0, 3))
-    b = replace(A, observations=rows.select(np.where(rows.label_id == 1, ~no_test.any(0), few)))
-    scores = transfer(A, b, [0.7])
-    apple, bench = (
-        scores.select((scores.category == n) & (scores.predictor == "raw")) for n in ("apple", "bench")
-    )
-    assert (apple.views.tolist(), bench.views.tolist()) == ([14, 0], [1, 1])
-    assert np.isfinite(apple.ssim_error[0] + bench.ssim_error).all()
-    for name in ("ssim_error", "bias", "outside", "iteration_error", "hit", "regret", "regret_share"):
-        assert math.isnan(getattr(apple, name)[1])
-    assert (apple.reachable[1], apple.missed[1]) == (0, 0)
-    assert "on test views" in headline(summary_table(scores))
-    alone = replace(b, test_views=b.test_views[:0])
-    assert "on train views" in headline(summary_table(transfer(A, alone, [0.7])))
-    transfer_figure(A, b)
-
-
-def test_levels_that_another_runs_models_choose_for_a_view():
-    b = synthetic("b", {7: "apple", 9: "else"}, unit=3.0)  # all of B's distances are three times A's
-    view = int(b.test_views[0])
-    seen = b.observations.select(b.observations.view == view)
-    here = dict(zip(seen.label_id.tolist(), seen.distance.tolist(), strict=True))
-    for target in (0.5, 0.7, 0.8):
-        own = plan_view(b.models, b.counts, here, target, view).levels
-        levels = transferred_levels(A, b, view, here, target, "extent")
-        assert levels == {7: own[7]}  # `else` is not shared
-
-
-def test_what_is_not_known_is_predicted_by_the_median():
-    b = replace(A, extent=math.nan, spacings={1: 0.01})
-    scores = transfer(A, b, [0.7])
-    blind = np.isin(scores.predictor, ["extent", "median"]) | (
-        (scores.predictor == "footprint") & (scores.category == "bench")
-    )
-    assert (scores.outside == np.where(blind, 1.0, 0.0)).all()
-    assert (scores.ssim_error[blind] > 0.05).all()
-    assert (scores.ssim_error[~blind] < 1e-6).all()
 
 
 def test_scores_by_hand():
@@ -293,13 +238,3 @@ def test_a_run_predicts_itself_like_its_own_models(job, tmp_path):
     assert fitted.focals == pytest.approx([40.0] * VIEWS)
     assert set(fitted.spacings) == set(LABELS)
     assert len(load_fitted(job).observations) == len(LEVELS) * 2 * VIEWS
-
-
-def test_runs_that_were_measured_differently(job, tmp_path):
-    other = Job(RunDir(tmp_path / "other", "snapshots"), print)
-    shutil.copytree(job.run.path, other.run.path)
-    record(other.run, "observe", {"distance": "minimum"}, [], 0.0)
-    with pytest.raises(
-        RunError, match=r"other: measured with --fit\.distance minimum, .*run with percentile; "
-    ):
-        transfer_runs(job, other, tmp_path / "out")

@@ -166,11 +166,23 @@ def test_views_are_seen_before_they_are_judged():
     assert rounds == [{True}, {False}, {True}, {True}, {False}, {True}]
 
 
-def test_where_it_is_off():
-    config = TrainConfig(outliers=True)
-    assert not capped_config(config, 10, 10).outliers  # it is fitted to what the run's training left
-    with pytest.raises(RunError, match=r"--train\.outliers does not go with --blocks\.count"):
+def test_a_resized_training_has_none():
+    # It is fitted to what the run's training left.
+    assert not capped_config(TrainConfig(outliers=True), 10, 10).outliers
+
+
+@pytest.mark.parametrize(
+    ("option", "config"),
+    [
+        ("outliers", TrainConfig(outliers=True)),
+        ("poses", TrainConfig(poses=True)),
+        ("exposure affine", TrainConfig(exposure="affine")),
+    ],
+)
+def test_blocks_refuse_what_is_of_the_whole_scene(option, config):
+    with pytest.raises(RunError, match=rf"--train\.{option} does not go with --blocks\.count; leave out one"):
         blocks.check(BlocksConfig(count=2), config)
+    blocks.check(BlocksConfig(), config)
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ from sagesplat.stages.clean import clean_levels
 from sagesplat.stages.label import lift_labels, make_masks
 from sagesplat.stages.scene import open_scene
 from sagesplat.train import densify, sky
-from sagesplat.train.events import Step, Trained
+from sagesplat.train.events import Trained
 from sagesplat.train.lr_schedule import lr_schedule
 from sagesplat.train.nested import order, train_capped
 from sagesplat.train.sky import Shell, find_sky, read_sky, sky_labels, write_sky
@@ -244,30 +244,6 @@ def test_without_sky_nothing_changes(finished_run, tmp_path):
     train_scene(job, replace(SMALL_RUN.train, sky="off"), BlocksConfig(), 0)
     before, after = (read_level(path / "levels" / "000004.npz") for path in (finished_run, folder))
     assert all(torch.equal(getattr(before, name), getattr(after, name)) for name in PARAMETERS)
-
-
-def test_a_killed_training_goes_on_with_the_sky(capture, tmp_path):
-    _, photos, _ = capture
-    found, labels = of(capture)
-    begun, ids = found.begin(capture[0], labels)
-    config = TrainConfig(
-        max_steps=8, level_every=4, refine_every=3, refine_start=1, grow_grad=1e-9, sh_degree=1
-    )
-
-    def run(folder, until=99):
-        folder.mkdir(exist_ok=True)
-        for event in train_gaussians(
-            begun, photos, ids, config, backend="cpu", folder=folder, shell=found.shell
-        ):
-            if isinstance(event, Step) and event.step == until:
-                return None  # as if it were killed
-            if isinstance(event, Trained):
-                return event.gaussians
-        raise AssertionError
-
-    assert run(tmp_path / "killed", until=6) is None
-    whole, resumed = run(tmp_path / "whole"), run(tmp_path / "killed")
-    assert all(torch.equal(getattr(whole, name), getattr(resumed, name)) for name in PARAMETERS)
 
 
 def test_base_model_and_order(capture):

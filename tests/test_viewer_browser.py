@@ -693,17 +693,6 @@ def test_a_lost_context_is_said_and_comes_back_where_one_was(site: str, browser:
 
 
 @pytest.mark.slow
-def test_side_by_side_may_be_left_while_it_loads(site: str, browser: Any) -> None:
-    with open_page(site, browser=browser) as opened:
-        ready(opened)
-        for _ in range(6):
-            opened.page.keyboard.press("c")
-            opened.page.evaluate(FRAMES, 2)
-        settled(opened)
-        assert opened.complaints == []
-
-
-@pytest.mark.slow
 def test_a_budget_begins_with_what_is_loaded_and_a_link_keeps_it(site: str, browser: Any) -> None:
     with open_page(site, browser=browser) as opened:
         ready(opened)

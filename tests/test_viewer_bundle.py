@@ -508,17 +508,6 @@ def test_gains_never_rise_and_lie_on_the_hull(steps: list[tuple[int, float]]) ->
     assert (reached[known] >= ssim[known] - 1e-9).all()  # above every level
 
 
-def test_the_same_contents_give_the_same_bytes(tmp_path, contents, viewer) -> None:
-    for name in ("a", "b"):
-        write_bundle(tmp_path / name, contents, viewer)
-    write_bundle(tmp_path / "b", contents, viewer)  # once more, over itself
-    first, second = (
-        {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-        for folder in (tmp_path / "a", tmp_path / "b")
-    )
-    assert first == second
-
-
 def test_an_earlier_bundle_is_replaced_and_nothing_of_it_stays(tmp_path, contents, viewer) -> None:
     out = tmp_path / "out"
     write_bundle(out, contents, viewer)
@@ -569,8 +558,7 @@ def test_a_damaged_chunk_is_named_and_the_old_bundle_stays(tmp_path, contents, v
     path.unlink()
     if not missing:
         path.write_bytes(before[:-1] + b"x")
-    with pytest.raises(DataError, match=rf"{contents.chunks[1].uri}: .*sagesplat nest") as caught:
+    with pytest.raises(DataError, match=rf"{contents.chunks[1].uri}: .*sagesplat nest"):
         write_bundle(tmp_path / "out", contents, viewer)
-    assert "\n" not in str(caught.value)
     assert manifest_of(tmp_path / "out")["totals"]["count"] == 39
     assert not list(tmp_path.glob(".out*"))

@@ -127,6 +127,7 @@ def _listed(bundle: Path) -> list[Any]:
     return read_index(bundle.parent / "streams")
 
 
+@pytest.mark.slow
 @browser_test
 def test_every_step_works_by_keyboard(editing: Opened) -> None:
     page = editing.page
@@ -153,6 +154,7 @@ def test_every_step_works_by_keyboard(editing: Opened) -> None:
     assert page.locator(".editor").is_hidden()
 
 
+@pytest.mark.slow
 @browser_test
 def test_instances_are_a_tree_and_fold_back(editing: Opened) -> None:
     page = editing.page
@@ -173,6 +175,7 @@ def test_instances_are_a_tree_and_fold_back(editing: Opened) -> None:
     assert page.locator(".tree button").count() == 2
 
 
+@pytest.mark.slow
 @browser_test
 def test_a_phone_has_room_for_all_of_it(bundle: Path, browser: Any) -> None:
     with serve(bundle) as url, open_page(url, (360, 740), browser=browser, touch=True) as opened:

@@ -6,11 +6,10 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,10 +18,10 @@ import numpy as np
 import torch
 import tyro
 
-from benchmarks.common import GARDEN, RESULTS, ROOT, rounded
+from benchmarks.common import GARDEN, RESULTS, rounded
 from benchmarks.gpu.agreement import agreement
-from benchmarks.gpu.base import Asked, Bench, Outcome, one_line, wait
-from benchmarks.gpu.runs import freeze, full, multi, race
+from benchmarks.gpu.base import Asked, Bench, Outcome, one_line
+from benchmarks.gpu.runs import full, multi, race
 from benchmarks.gpu.split import split
 from sagesplat.core.errors import BackendUnavailable, SageError
 from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
@@ -33,7 +32,7 @@ from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Masks, Taxonomy
 
 CHECKS: dict[str, Callable[[Bench], Outcome]] = {
-    "agreement": agreement, "full": full, "race": race, "freeze": freeze, "split": split, "multi": multi,
+    "agreement": agreement, "full": full, "race": race, "split": split, "multi": multi,
 }  # fmt: skip
 
 
@@ -52,8 +51,8 @@ def main(
 ) -> None:
     """All checks that a machine with a GPU owes, in so many minutes; `--device cpu` tries the script.
 
-    `runs`: the trainings of `race` and `freeze`, of ours, gsplat, mcmc (gsplat's, as many Gaussians as
-    ours), large (ours, four millions), third, two_thirds, all; none: all of them.
+    `runs`: the trainings of `race`, of ours, gsplat, mcmc (gsplat's, as many Gaussians as ours), large
+    (ours, four millions); none: all of them.
     """
     asked = Asked(scene, downscale, steps, minutes, device, only, runs, masks, lpips, out, write)
     raise SystemExit(check(asked))
@@ -92,10 +91,9 @@ def check(asked: Asked) -> int:
 
 
 def check_all(bench: Bench) -> dict[str, Outcome]:
-    """Each check by itself; where the device is lost for this process, the others in a new one."""
+    """Each check by itself."""
     outcomes: dict[str, Outcome] = {}
-    names = [name for name in CHECKS if bench.chosen(name)]
-    for i, name in enumerate(names):
+    for name in filter(bench.chosen, CHECKS):
         begin = time.perf_counter()
         try:
             if bench.left() <= 0:
@@ -106,38 +104,6 @@ def check_all(bench: Bench) -> dict[str, Outcome]:
         seconds = time.perf_counter() - begin
         print(f"{name}: {outcomes[name].state} after {seconds:.0f} s, {outcomes[name].line}", flush=True)
         save(bench, name, {**vars(outcomes[name]), "check_seconds": seconds})
-        if names[i + 1 :] and lost(bench.device):
-            return outcomes | anew(bench, names[i + 1 :])
-    return outcomes
-
-
-def lost(device: torch.device) -> bool:
-    """Whether an illegal access or the like has made the device useless for this process."""
-    try:
-        wait(device)
-        torch.zeros(1, device=device).item()
-    except RuntimeError:
-        return True
-    return False
-
-
-def anew(bench: Bench, names: Sequence[str]) -> dict[str, Outcome]:
-    """The outcomes of checks that a new process does."""
-    print(f"the device is lost: {', '.join(names)} in a new process", flush=True)
-    minutes = max(0.1, bench.left() / 60 - 0.5)  # it has to start
-    asked = replace(bench.asked, only=tuple(names), minutes=minutes)
-    assert asked.out is not None
-    try:
-        subprocess.run(asked.command(), cwd=ROOT, timeout=60 * minutes + 60, check=False)
-    except subprocess.TimeoutExpired:
-        print("the new process was ended", flush=True)
-    outcomes = {}
-    for name in names:
-        try:
-            found = json.loads((asked.out / f"{name}.json").read_text())
-            outcomes[name] = Outcome(found["state"], found["line"])
-        except (OSError, ValueError, KeyError):
-            outcomes[name] = Outcome("FAILED", "the new process did not come to it")
     return outcomes
 
 

@@ -1,6 +1,5 @@
 """What the checks of a machine with a GPU share."""
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -34,17 +33,6 @@ class Asked:
     lpips: Path | None = None
     out: Path | None = None
     write: bool = False
-
-    def command(self) -> list[str]:
-        """The same as words for a new process."""
-        words = [sys.executable, "-m", "benchmarks.gpu", "--scene", str(self.scene)]
-        words += ["--downscale", str(self.downscale), "--steps", str(self.steps)]
-        words += ["--minutes", str(self.minutes), "--device", self.device, *["--write"] * self.write]
-        for name in ("masks", "lpips", "out"):
-            if (path := getattr(self, name)) is not None:
-                words += [f"--{name}", str(path)]
-        words += ["--runs", *self.runs] * bool(self.runs)
-        return words + ["--only", *self.only] * bool(self.only)
 
 
 @dataclass(frozen=True)
@@ -88,7 +76,7 @@ class Bench:
     labels: np.ndarray  # int16 [P], category of each point
     steps: int = 0  # of each long run, once it is known
     runs: dict[str, Any] = field(default_factory=dict)  # trainings (or the errors they ended with) by name
-    trained: Gaussians | None = None  # by the run without freeze, on the CPU
+    trained: Gaussians | None = None  # on the CPU
 
     @cached_property
     def device(self) -> torch.device:

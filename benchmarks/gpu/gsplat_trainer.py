@@ -5,19 +5,19 @@ schedule are those of its `examples/simple_trainer.py`, which the wheel does not
 `fused`, one for each parameter, rates of 3DGS, the means' falling to a hundredth, a degree of harmonics each
 1000 steps, `packed=False`, near 0.01, far 1e10, loss 0.8 L1 + 0.2 (1 - SSIM). What it does beside training is
 left out, in its favour: the data loader (photos lie on the GPU as floats), the progress bar, which waits for
-the loss at every step, and tensorboard. With `cap` it is that example's `mcmc` setting.
+the loss at every step, and tensorboard; and its loss is our fused one, as a slow SSIM must not decide a race.
+With `cap` it is that example's `mcmc` setting.
 
 1.5.3's strategy never resets opacities: `step % reset_every == 0 & step > 0` is never true. It is raced as
 it is.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.gaussians import Gaussians
@@ -31,40 +31,6 @@ NAMES = {  # gsplat's name: ours
     "means": "means", "scales": "log_scales", "quats": "quats", "opacities": "logit_opacities",
     "sh0": "sh0", "shN": "shN",
 }  # fmt: skip
-Loss = Callable[[Tensor, Tensor, float], Tensor]  # of two images [H, W, 3] in [0, 1] and the weight of SSIM
-
-
-def losses() -> tuple[str, Loss]:
-    """The loss of the recipe and its name: fused_ssim's, or where that is missing ours on a GPU.
-
-    A slow loss must not decide a race of trainers; the times of all are written beside it.
-    """
-    try:
-        from fused_ssim import fused_ssim  # type: ignore
-    except ImportError:
-        return ("ours", photometric_loss) if torch.cuda.is_available() else ("torch", torch_loss)
-
-    def fused(rgb: Tensor, photo: Tensor, weight: float) -> Tensor:
-        x, y = (image.permute(2, 0, 1)[None] for image in (rgb, photo))
-        return torch.lerp(F.l1_loss(rgb, photo), 1 - fused_ssim(x, y, padding="valid"), weight)
-
-    return "fused_ssim", fused
-
-
-def torch_loss(rgb: Tensor, photo: Tensor, weight: float) -> Tensor:
-    """The loss in plain torch operations, SSIM over whole windows of 11 x 11 (sigma 1.5) only."""
-    at = torch.arange(11, device=rgb.device) - 5.0
-    taps = torch.exp(-(at**2) / (2 * 1.5**2))
-    taps = taps / taps.sum()
-    x, y = rgb.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]
-    maps = torch.cat([x, y, x * x, y * y, x * y], 1)
-    kernel = taps.expand(maps.shape[1], 1, 11)
-    maps = F.conv2d(F.conv2d(maps, kernel[..., None], groups=15), kernel[:, :, None], groups=15)
-    mx, my, xx, yy, xy = maps.split(3, 1)
-    c1, c2 = 0.01**2, 0.03**2
-    quality = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
-    quality = quality / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
-    return torch.lerp(F.l1_loss(rgb, photo), 1 - quality.mean(), weight)
 
 
 def train(
@@ -73,7 +39,6 @@ def train(
     photos: Sequence[Tensor],  # float32 [H, W, 3] in [0, 1], on the device
     extent: float,
     config: TrainConfig,  # of ours: its rates, steps and schedule are used
-    loss: Loss,
     seed: int = 0,
     cap: int = 0,  # Gaussians of 3DGS-MCMC; 0: its default strategy
 ) -> Iterator[tuple[int, Gaussians]]:
@@ -122,7 +87,7 @@ def train(
             sh_degree=min(step // plan.raise_sh_every, config.sh_degree),
         )  # fmt: skip
         strategy.step_pre_backward(params, optimizers, state, step, info)
-        value = loss(images[0], photo, SSIM_WEIGHT)
+        value = photometric_loss(images[0], photo, SSIM_WEIGHT)
         if cap:  # its regularisation of opacities and scales
             value = value + 0.01 * (params["opacities"].sigmoid().mean() + params["scales"].exp().mean())
         value.backward()

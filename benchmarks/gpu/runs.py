@@ -1,38 +1,36 @@
-"""Whole trainings on a GPU: ours, ours with the freeze of categories, and gsplat's."""
+"""Whole trainings on a GPU: ours and gsplat's."""
 
-import math
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
 from benchmarks.gpu import gsplat_trainer
-from benchmarks.gpu.base import Bench, Clock, Outcome, milliseconds, one_line, wait
+from benchmarks.gpu.base import Bench, Clock, Outcome, one_line, wait
 from benchmarks.gpu.split import grown, stages
 from sagesplat.adapt.observe import render_rgb
 from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import SageError
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.metrics.image import photometric_loss, psnr, ssim_map
+from sagesplat.metrics.image import psnr, ssim_map
 from sagesplat.metrics.lpips import Net, load_lpips
 from sagesplat.raster import rasterize
 from sagesplat.train import densify, trainer
-from sagesplat.train.early_stopping import ActiveTiles, label_quality, measured_views
 from sagesplat.train.events import LevelSaved, Step, Trained
 from sagesplat.train.parallel import train_together
-from sagesplat.train.photo_loader import PhotoLoader
 from sagesplat.train.strategy import schedule_of
 
 AS_GSPLAT: dict[str, Any] = {"lr_schedule": "published", "antialiased": False}  # its example's defaults
 KEPT_BACK = 0.1  # of the time, for what comes after the long runs
 LARGE = 4_000_000  # Gaussians of `large`: ours with about as many as gsplat makes of garden
-WEIGHTS = {  # time of a run, guessed
-    "ours": 1.0, "gsplat": 1.3, "mcmc": 0.9, "large": 1.3, "third": 0.8, "two_thirds": 0.7, "all": 0.5,
-}  # fmt: skip
+WEIGHTS = {"ours": 1.0, "gsplat": 1.3, "mcmc": 0.9, "large": 1.3}  # time of a run, guessed
+
+
+Moment = tuple[int, Gaussians]  # a step, and the model in training; the clock is stopped
 
 
 @dataclass(eq=False)
@@ -46,8 +44,6 @@ class Run:
     gaussians: Gaussians  # on the CPU
     peak_mib: float
     stopped: str | None  # why it did not end by itself
-    label_ssim: dict[int, float]  # on training views, at a third of the run
-    settings: dict[str, Any]
 
     def figures(self) -> dict[str, Any]:
         """All but the Gaussians."""
@@ -56,15 +52,6 @@ class Run:
     def reaches(self, ssim: float) -> float | None:
         """Seconds of training after which the test views are this similar."""
         return time_to([(p["seconds"], p["ssim"]) for p in self.curve], ssim)
-
-
-@dataclass(frozen=True)
-class Moment:
-    """A model in training, the clock stopped."""
-
-    step: int
-    gaussians: Gaussians
-    frozen: Mapping[int, int] = field(default_factory=dict)
 
 
 def full(bench: Bench) -> Outcome:
@@ -90,12 +77,10 @@ def full(bench: Bench) -> Outcome:
 
 
 def race(bench: Bench) -> Outcome:
-    """gsplat's recipes, ours, and ours with the freeze: time to the same SSIM on test views."""
+    """gsplat's recipes and ours: time to the same SSIM on test views."""
     runs: dict[str, Run] = {}
     missed: dict[str, str] = {}
     hopeless = dict.fromkeys(("gsplat", "mcmc", "large"), "it needs a GPU") if bench.small else {}
-    if bench.masks is None:
-        hopeless |= dict.fromkeys(("third", "two_thirds", "all"), "no label images")
     for name in bench.asked.runs or WEIGHTS:
         if name in hopeless:
             missed[name] = hopeless[name]
@@ -111,8 +96,6 @@ def race(bench: Bench) -> Outcome:
     times = {end: {name: run.reaches(ssim) for name, run in runs.items()} for end, ssim in finals.items()}
     figures: dict[str, Any] = {"final_ssim": finals, "seconds_to_the_end_of": times, "missed": missed}
     figures["runs"] = {name: run.figures() for name, run in runs.items()}
-    if not bench.small:
-        figures["loss_ms"] = loss_times(bench)
     parts = []
     for name, run in runs.items():
         others = ((n, t) for n, t in times[name].items() if n != name and n in ("gsplat", "ours"))
@@ -122,33 +105,6 @@ def race(bench: Bench) -> Outcome:
     parts += [f"{name}: {why}" for name, why in missed.items()]
     failed = any(name not in hopeless for name in missed)
     return Outcome("FAILED" if failed else "ok", "; ".join(parts), figures)
-
-
-def freeze(bench: Bench) -> Outcome:
-    """What the freeze of categories saves: tiles, time per step, time in all."""
-    whole = run_of(bench, "ours")
-    figures: dict[str, Any] = {"without": {"seconds": whole.seconds, "steps": whole.steps}}
-    figures["label_ssim_at_a_third"], parts, failed = whole.label_ssim, [], False
-    for name in _frozen(bench):
-        try:
-            run = run_of(bench, name)
-        except Exception as error:
-            parts, failed = [*parts, f"{name}: {one_line(error)}"], True
-            continue
-        figures[name] = run.figures()
-        last = run.curve[-1]
-        parts.append(
-            f"at {run.settings['freeze_at']}: "
-            f"{len(run.settings['frozen'])} of {len(whole.label_ssim)} labels, "
-            f"{100 * run.settings['skipped']:.0f} % of tiles, {last['step_ms']:.2f} ms a step at the end "
-            f"({whole.curve[-1]['step_ms']:.2f} without), {run.seconds:.1f} of {whole.seconds:.1f} s"
-        )
-    return Outcome("FAILED" if failed else "ok", "; ".join(parts), figures)
-
-
-def _frozen(bench: Bench) -> list[str]:
-    """The trainings that freeze which are asked for."""
-    return [name for name in ("third", "two_thirds", "all") if name in (bench.asked.runs or WEIGHTS)]
 
 
 def multi(bench: Bench) -> Outcome:
@@ -175,7 +131,7 @@ def multi(bench: Bench) -> Outcome:
 
 
 def run_of(bench: Bench, name: str) -> Run:
-    """A training that several checks look at, done once; `third`, ... are those that freeze."""
+    """A training that several checks look at, done once."""
     if name not in bench.runs:
         try:
             bench.runs[name] = _train(bench, name)
@@ -190,14 +146,8 @@ def run_of(bench: Bench, name: str) -> Run:
 def _train(bench: Bench, name: str) -> Run:
     if bench.left() < KEPT_BACK * 60 * bench.asked.minutes:
         raise RuntimeError("no time left")
-    if name in ("ours", "gsplat", "mcmc", "large"):
-        most = LARGE if name == "large" else 0
-        config = TrainConfig(max_steps=steps_of(bench), max_gaussians=most, **AS_GSPLAT)
-    elif bench.masks is None:
-        raise RuntimeError("no label images: nothing to freeze")
-    else:
-        target = targets(run_of(bench, "ours").label_ssim)[name]
-        config = TrainConfig(max_steps=steps_of(bench), freeze_at=target, **AS_GSPLAT)
+    most = LARGE if name == "large" else 0
+    config = TrainConfig(max_steps=steps_of(bench), max_gaussians=most, **AS_GSPLAT)
     if name in ("gsplat", "mcmc"):
         moments = gsplats(bench, config, mcmc=name == "mcmc")
     else:
@@ -214,12 +164,8 @@ def steps_of(bench: Bench) -> int:
     """Steps of each long run: as asked, or as many as there is time for when first asked."""
     if bench.steps == 0:
         names = ["ours"]
-        if bench.chosen("race") or bench.chosen("freeze"):
+        if bench.chosen("race") and not bench.small:
             names = [name for name in WEIGHTS if name in (bench.asked.runs or WEIGHTS)]
-        if bench.masks is None:
-            names = [name for name in names if name in ("ours", "gsplat", "mcmc", "large")]
-        if not bench.chosen("race") or bench.small:
-            names = [name for name in names if name not in ("gsplat", "mcmc", "large")]
         took = stages(bench, grown(bench), repeats=3 if bench.small else 60)["step"]
         room = bench.left() - KEPT_BACK * 60 * bench.asked.minutes
         room -= 0 if bench.small else 8 * len(names)  # looking at the models takes time too
@@ -232,56 +178,38 @@ def steps_of(bench: Bench) -> int:
 
 def ours(bench: Bench, config: TrainConfig) -> Iterator[Moment]:
     """Our trainer, at its levels and at its end."""
-    masks = bench.masks if config.freeze_at is not None else None
-    training = trainer.begin(
-        bench.scene, bench.photos, bench.labels, config, masks=masks, backend=bench.backend
-    )
+    training = trainer.begin(bench.scene, bench.photos, bench.labels, config, backend=bench.backend)
     for event in training.run():
         if isinstance(event, LevelSaved | Trained):
-            state = training.state
-            yield Moment(state.step, state.gaussians, dict(state.frozen))
+            yield training.state.step, training.state.gaussians
 
 
 def gsplats(bench: Bench, config: TrainConfig, mcmc: bool = False) -> Iterator[Moment]:
     """gsplat's recipe, or its MCMC with as many Gaussians as ours; photos are on the device at the start."""
     rows = bench.scene.train_ids.tolist()
     photos = [torch.from_numpy(bench.photos[row]).to(bench.device).float() / 255 for row in rows]
-    cameras, (_, loss) = [bench.scene.views[row].camera for row in rows], gsplat_trainer.losses()
+    cameras = [bench.scene.views[row].camera for row in rows]
     camera, points = cameras[0], len(bench.scene.points.xyz)
     most = densify.cap(config, camera.width * camera.height, points) if mcmc else 0
-    moments = gsplat_trainer.train(
-        bench.initial(), cameras, photos, bench.scene.extent, config, loss, cap=most
-    )
-    return (Moment(step, g) for step, g in moments)
+    return gsplat_trainer.train(bench.initial(), cameras, photos, bench.scene.extent, config, cap=most)
 
 
 def watch(bench: Bench, name: str, config: TrainConfig, moments: Iterator[Moment]) -> Run:
     """Train and, with the clock stopped, look at the model from time to time."""
     plan, limit = schedule_of(config), bench.end - KEPT_BACK * 60 * bench.asked.minutes
-    clock, curve, label_ssim, stopped, last = Clock(bench.device), [], {}, None, None
+    clock, curve, stopped, last = Clock(bench.device), [], None, None
     if bench.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(bench.device)
     clock.start()
-    for moment in moments:
+    for step, g in moments:
         clock.stop()
-        step, last = moment.step, moment
+        last = step, g
         degree = min(config.sh_degree, step // plan.raise_sh_every)
         before = curve[-1] if curve else {"step": 0, "seconds": 0.0}
         if step > before["step"]:
-            point = {"step": step, "seconds": clock.seconds, "gaussians": len(moment.gaussians)}
+            point = {"step": step, "seconds": clock.seconds, "gaussians": len(g)}
             point["step_ms"] = 1e3 * (clock.seconds - before["seconds"]) / (step - before["step"])
-            point |= view_quality(bench, moment.gaussians, degree)
-            point |= {"frozen": len(moment.frozen), "skipped": skipped(bench, moment.frozen)}
-            curve.append(point)
-        if name == "ours" and bench.masks and not label_ssim and step >= config.max_steps / 3:
-            work, feed = (
-                ActiveTiles(bench.scene, bench.masks),
-                PhotoLoader(bench.scene, bench.photos, bench.device),
-            )
-            label_ssim = label_quality(
-                moment.gaussians, work, feed, measured_views(bench.scene, bench.masks), config, degree,
-                backend=bench.backend,
-            )  # fmt: skip
+            curve.append(point | view_quality(bench, g, degree))
         if time.perf_counter() > limit:
             stopped = f"out of time at step {step:,}"
             break
@@ -290,21 +218,7 @@ def watch(bench: Bench, name: str, config: TrainConfig, moments: Iterator[Moment
         clock.stop()
     assert last is not None
     peak = torch.cuda.max_memory_allocated(bench.device) / 2**20 if bench.device.type == "cuda" else 0.0
-    settings: dict[str, Any] = {"max_steps": config.max_steps, "freeze_at": config.freeze_at}
-    settings |= {"frozen": dict(last.frozen), "skipped": skipped(bench, last.frozen)}
-    if name in ("gsplat", "mcmc"):
-        settings["loss"] = gsplat_trainer.losses()[0]
-    g = last.gaussians.to("cpu")
-    return Run(name, last.step, clock.seconds, curve, g, peak, stopped, label_ssim, settings)
-
-
-def skipped(bench: Bench, frozen: Mapping[int, int]) -> float:
-    """Share of the tiles of training views that show nothing but what is frozen."""
-    if not frozen or bench.masks is None:
-        return 0.0
-    work = ActiveTiles(bench.scene, bench.masks, frozenset(frozen))
-    found = [work.tiles(row) for row in bench.scene.train_ids.tolist()[::8]]
-    return float(np.mean([1 - tiles.mean() for tiles in found if tiles is not None]))
+    return Run(name, last[0], clock.seconds, curve, last[1].to("cpu"), peak, stopped)
 
 
 @torch.no_grad()
@@ -334,25 +248,6 @@ def lpips(bench: Bench, g: Gaussians, net: Net) -> float:
         image = render_rgb(there, bench.scene.views[row].camera, backend=bench.backend, antialiased=False)
         values.append(metric(image, bench.photos[row].astype(np.float32) / 255))
     return float(np.mean(values))
-
-
-def loss_times(bench: Bench) -> dict[str, float]:
-    """Milliseconds of the race's losses and their gradients, so that its times can be put right."""
-    camera = bench.scene.views[0].camera
-    photo = torch.rand(camera.height, camera.width, 3, device=bench.device)
-    name, recipe = gsplat_trainer.losses()
-    found = {}
-    for of, loss in {"ours": photometric_loss, "torch": gsplat_trainer.torch_loss, name: recipe}.items():
-        rgb = torch.rand_like(photo).requires_grad_()
-        found[of] = milliseconds(bench.device, lambda loss=loss, rgb=rgb: loss(rgb, photo, 0.2).backward())
-    return found
-
-
-def targets(label_ssim: Mapping[int, float]) -> dict[str, float]:
-    """Targets that a third, two thirds and all of the labels have reached, given the SSIM of each."""
-    best = sorted(label_ssim.values(), reverse=True)
-    places = {"third": math.ceil(len(best) / 3), "two_thirds": math.ceil(2 * len(best) / 3), "all": len(best)}
-    return {name: max(0.001, math.floor(best[place - 1] * 1e3) / 1e3) for name, place in places.items()}
 
 
 def time_to(curve: Sequence[tuple[float, float]], ssim: float) -> float | None:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchmarks.gpu.base import Bench, Outcome, between, mark, milliseconds, wait
 from benchmarks.kernels import BACKWARD_OPERATIONS, FORWARD_OPERATIONS
@@ -37,20 +36,13 @@ def split(bench: Bench) -> Outcome:
     """Where the time of a step goes, and how near each part is to what the device can do."""
     g, repeats = grown(bench), 3 if bench.small else 50
     figures: dict[str, Any] = {"gaussians": len(g), "stages": stages(bench, g, repeats=repeats)}
-    half = torch.arange(len(g), device=bench.device) % 2 > 0
-    figures["half_trainable"] = stages(bench, g, trainable=half, repeats=repeats)
     limits = figures["limits"] = ceilings(bench.device)
-    isects = 0.0
+    isects = 0
+    camera = bench.scene.views[int(bench.scene.train_ids[0])].camera
     if not bench.small:
-        cuda.PACKED = True  # type: ignore
-        try:
-            figures["packed"] = stages(bench, g, repeats=repeats)
-        finally:
-            cuda.PACKED = False
-        figures["binning"] = binning(bench, g)
-        isects = figures["binning"]["intersections"]
-    camera = bench.scene.views[0].camera
-    least = traffic(len(g), int(isects), camera.width * camera.height, num_bases(3))
+        with torch.no_grad():
+            isects = len(cuda.Tiles(cuda.splat(g, camera, 3, False), camera, None).ids)
+    least = traffic(len(g), isects, camera.width * camera.height, num_bases(3))
     parts = figures["kernels"] = kernels(bench, g, min(repeats, 20))
     for name, part in parts.items():
         if name in least and part["ms"]:
@@ -61,10 +53,7 @@ def split(bench: Bench) -> Outcome:
     # what is missing to 1 the device waits for the host
     busy = figures["busy"] = sum(part["ms"] for part in parts.values()) / whole
     shares = (f"{name} {part['ms']:.2f}" for name, part in parts.items())
-    modes = "".join(f", {n} {figures[n]['step']:.2f}" for n in ("packed", "half_trainable") if n in figures)
-    return Outcome(
-        "ok", f"step {whole:.2f} ms{modes}; device busy {busy:.0%}: {', '.join(shares)} ms", figures
-    )
+    return Outcome("ok", f"step {whole:.2f} ms; device busy {busy:.0%}: {', '.join(shares)} ms", figures)
 
 
 def grown(bench: Bench) -> Gaussians:
@@ -78,9 +67,9 @@ def grown(bench: Bench) -> Gaussians:
     return replace(g, means=moved, log_scales=g.log_scales - 0.5, shN=torch.randn_like(g.shN) * 0.02)
 
 
-def stages(bench: Bench, g: Gaussians, *, trainable: Tensor | None = None, repeats: int) -> dict[str, float]:
+def stages(bench: Bench, g: Gaussians, repeats: int) -> dict[str, float]:
     """Milliseconds of the parts of a training step, in a row as the trainer has them, over several views."""
-    step = stepping(bench, g, trainable)
+    step = stepping(bench, g)
     for turn in range(min(repeats, 10)):
         step(turn)
     wait(bench.device)
@@ -96,7 +85,7 @@ def stages(bench: Bench, g: Gaussians, *, trainable: Tensor | None = None, repea
     return found | {"step": whole}
 
 
-def stepping(bench: Bench, g: Gaussians, trainable: Tensor | None) -> Callable[[int], list[Any]]:
+def stepping(bench: Bench, g: Gaussians) -> Callable[[int], list[Any]]:
     """A function that takes a step, on the view of a turn, and returns marks of when each part was over."""
     state = initial_state(g.to("cpu"), 0).to(bench.device)
     state.gaussians = replace(g, **{name: p.detach().clone() for name, p in g.parameters().items()})
@@ -112,10 +101,7 @@ def stepping(bench: Bench, g: Gaussians, trainable: Tensor | None) -> Callable[[
         photo, camera = feed(int(rows[turn % min(16, len(rows))]))
         leaves = {name: p.detach().requires_grad_() for name, p in state.gaussians.parameters().items()}
         marks = [mark(bench.device)]
-        render = rasterize(
-            replace(state.gaussians, **leaves), camera, trainable=trainable, workspace=space,
-            backend=bench.backend,
-        )  # fmt: skip
+        render = rasterize(replace(state.gaussians, **leaves), camera, workspace=space, backend=bench.backend)
         marks.append(mark(bench.device))
         loss = photometric_loss(render.rgb, photo, 0.2, None, space)
         marks.append(mark(bench.device))
@@ -124,7 +110,7 @@ def stepping(bench: Bench, g: Gaussians, trainable: Tensor | None) -> Callable[[
         densify.observe_gradients(state, render, camera.width, camera.height, everything)
         state.step += 1
         grads = {name: p.grad for name, p in leaves.items() if p.grad is not None}
-        optim.update(state, grads, rates, 3, everything if trainable is None else trainable)
+        optim.update(state, grads, rates, 3, everything)
         marks.append(mark(bench.device))
         return marks
 
@@ -142,27 +128,11 @@ def ceilings(device: torch.device) -> dict[str, float]:
     return {"bytes_per_s": 2e3 * x.nbytes / copy, "flop_per_s": 2e3 * float(len(a)) ** 3 / product}
 
 
-@torch.no_grad()
-def binning(bench: Bench, g: Gaussians) -> dict[str, float]:
-    """Time of the lists of tiles: on the device, and until the host may go on; it waits for their length."""
-    camera = bench.scene.views[int(bench.scene.train_ids[0])].camera
-    splats = cuda.splat(g, camera, 3, False)
-    tiles = cuda.Tiles(splats, camera, None)
-    on_device = milliseconds(bench.device, lambda: cuda.Tiles(splats, camera, None))
-    waits = []
-    for _ in range(20):
-        wait(bench.device)
-        begin = time.perf_counter()
-        cuda.Tiles(splats, camera, None)
-        waits.append(1e3 * (time.perf_counter() - begin))
-    return {"intersections": len(tiles.ids), "device_ms": on_device, "host_ms": float(np.median(waits))}
-
-
 def kernels(bench: Bench, g: Gaussians, repeats: int) -> dict[str, dict[str, float]]:
     """Milliseconds of kernels in a step by what they belong to, and the longest of the rest."""
     from torch.profiler import ProfilerActivity, profile
 
-    step = stepping(bench, g, None)
+    step = stepping(bench, g)
     for turn in range(3):
         step(turn)
     wait(bench.device)

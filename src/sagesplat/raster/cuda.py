@@ -42,7 +42,7 @@ from sagesplat.raster.render import BLUR, NEAR, TILE, Render
 from sagesplat.scene.scene import Camera
 
 DEVICE = "cuda"  # where tensors have to be
-PACKED = False  # project into lists of what is in view: less memory, one more wait; a benchmark may switch
+PACKED = False  # project into lists of what is in view: less memory, one more wait; tests draw both
 FAR = 1e30  # gsplat wants one, the other backends have none
 VERSIONS = ((1, 5, 3), (1, 7))  # of gsplat: from, below
 

@@ -44,7 +44,8 @@ def measure_borders(job: Job) -> None:
         return [str(run.adapted / "blocks.md")]
 
     made = [run.block(i).provenance(s) for i in range(len(read_blocks(file))) for s in (*_TIMED, "interior")]
-    inputs = [*run.scene_files, run.provenance("train"), run.prefixes, file, *(p for p in made if p.exists())]
+    levels = [run.prefixes, run.cells]
+    inputs = [*run.scene_files, run.provenance("train"), *levels, file, *(p for p in made if p.exists())]
     run_stage(job, "borders", {}, inputs, [table_file, run.adapted / "borders.csv"], make)
 
 

@@ -22,7 +22,7 @@ from sagesplat.train.state import TrainState
 REFINE_STOP = 25_000  # step of 30,000 at which refinement ends, as published
 MOST = 51  # Gaussians that may share a place; larger counts are treated as 51
 OPACITY_WEIGHT, SCALE_WEIGHT = 0.01, 0.01  # of the mean opacity and scale in the loss, as published
-# Steps of a training that has these: in a few thousand they cost 0.2 to 1 dB (docs/developers/far.md).
+# Steps of a training that has these: in a few thousand they cost 0.2 to 1 dB (docs/developers/nested.md).
 REGULARISED_FROM = 15_000
 _GROWTH = 0.05  # of the present count, at each refinement, as published
 _GROWN_BY = 0.5  # share of the refinements after which even a short run has reached its cap
