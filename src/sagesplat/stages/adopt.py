@@ -91,7 +91,9 @@ def _check_run(run: RunDir, config: AdoptConfig) -> None:
     check_not_edited(run)
     if run.scene.exists() and not run.adopted.exists():
         raise RunError(f"{run.path}: holds a run of its own; choose a new folder for the splat")
-    if config.cameras is not None and config.cameras.resolve().is_relative_to(run.path.resolve()):
+    cameras = None if config.cameras is None else config.cameras.resolve()
+    ours = cameras is not None and cameras.is_relative_to(run.path.resolve())
+    if ours and not cameras.is_relative_to(run.from_python.resolve()):
         raise RunError(
             f"{config.cameras}: in the run folder, where adopt writes; copy it elsewhere, and give that path"
         )
