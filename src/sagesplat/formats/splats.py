@@ -131,6 +131,11 @@ def writer_of(path: Path) -> SplatWriter:
     """How files of this name are written; DataError for a name that says no format."""
     suffixes = [name for name in WRITERS if name.startswith(".") and path.name.lower().endswith(name)]
     writer = WRITERS.get(path.name) or WRITERS.get(max(suffixes, key=len, default=""))
+    if path.suffix.lower() in (".html", ".htm"):
+        raise DataError(
+            f"{path}: a page is no splat file; `sagesplat bundle RUN {path.name} --single-file` writes a page "
+            "with the viewer in it"
+        )
     if writer is None or not path.stem:
         raise DataError(f"{path}: its name says no format that is written; use {_listed(WRITERS)}")
     return writer
