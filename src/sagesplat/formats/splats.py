@@ -133,7 +133,7 @@ def writer_of(path: Path) -> SplatWriter:
     writer = WRITERS.get(path.name) or WRITERS.get(max(suffixes, key=len, default=""))
     if path.suffix.lower() in (".html", ".htm"):
         raise DataError(
-            f"{path}: a page is no splat file; `sagesplat bundle RUN {path.name} --single-file` writes a page "
+            f"{path}: a page is no splat file; `sagesplat bundle RUN {path} --single-file` writes a page "
             "with the viewer in it"
         )
     if writer is None or not path.stem:

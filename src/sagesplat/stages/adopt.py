@@ -131,7 +131,7 @@ def _make_capture(
         if photos and config.cameras:
             views = list(load_scene(config.cameras, **reading(scene)).views)
             cameras = [view.camera for view in views]
-            up, how = upward(cameras) * FLIP, f"those of {config.cameras}"
+            up, how = upward(cameras) * FLIP, f"those of {config.cameras.name}"
         else:
             cameras, up, how = _cameras(job, splat, given, config)
             views = _views(own, cameras)
@@ -189,7 +189,7 @@ def _cameras(
     """Where to look from, which direction is up there, and what that was decided by."""
     if given:
         cameras = [one.camera for one in given]
-        return cameras, upward(cameras) * FLIP, f"those of {config.cameras}"
+        return cameras, upward(cameras) * FLIP, f"those of {config.cameras.name}"
     drawn = free_cameras(
         splat.gaussians, config.views, up=splat.up if config.up == "auto" else config.up, fov=config.fov,
         size=config.size, seed=config.seed, kind=config.kind, backend=job.backend,
