@@ -120,16 +120,13 @@ class Gaussians:
         if tensors["sh0"].shape == (count, 3):
             tensors["sh0"] = tensors["sh0"][:, None]
         labels = torch.full((count,), -1) if label_ids is None else label_ids
-        try:
-            return checked(
-                cls(
-                    **{name: tensor.to(device, torch.float32) for name, tensor in tensors.items()},
-                    label_ids=labels.to(device, torch.int16),
-                )
-            )
-        except ValueError as error:
-            own, _, wrong = str(error).partition(" ")
-            raise DataError(f"splats: {names.get(own, own)} {wrong}; give N Gaussians of 3DGS") from None
+        tensors = {name: tensor.to(device, torch.float32) for name, tensor in tensors.items()}
+        tensors["label_ids"] = labels.to(device, torch.int16)
+        if misfit := _misfit(tensors):
+            shape = list(tensors[misfit].shape)
+            name = names.get(misfit, misfit)
+            raise DataError(f"splats: {name} is of shape {shape}; give N Gaussians as 3DGS has them")
+        return cls(**tensors)
 
     def to_gsplat(self) -> dict[str, Tensor]:
         """The tensors by the names of gsplat's trainers, as `from_gsplat` takes them; shared, no copies.
@@ -145,15 +142,20 @@ class Gaussians:
 
 def checked(g: Gaussians) -> Gaussians:
     """`g` itself; ValueError unless its tensors have the shapes and types above."""
-    n, k = len(g.logit_opacities), g.shN.shape[1] if g.shN.ndim == 3 else -1
-    shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
-    shapes |= {"sh0": (n, 1, 3), "shN": (n, k, 3), "label_ids": (n,)}
-    for name, shape in shapes.items():
-        if getattr(g, name).shape != shape or k not in (0, 3, 8, 15):
-            raise ValueError(f"{name} is of shape {list(getattr(g, name).shape)}")
+    if misfit := _misfit({f.name: getattr(g, f.name) for f in fields(g)}):
+        raise ValueError(f"{misfit} is of shape {list(getattr(g, misfit).shape)}")
     if any(p.dtype != torch.float32 for p in g.parameters().values()) or g.label_ids.dtype != torch.int16:
         raise ValueError("parameters are not float32, or label_ids not int16")
     return g
+
+
+def _misfit(tensors: Mapping[str, Tensor]) -> str | None:
+    """The name of a tensor that does not have the shape that the others ask for; None: all fit."""
+    opacities, shN = tensors["logit_opacities"], tensors["shN"]
+    n, k = opacities.shape[0] if opacities.ndim else -1, shN.shape[1] if shN.ndim == 3 else -1
+    shapes = {"logit_opacities": (n,), "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3)}
+    shapes |= {"sh0": (n, 1, 3), "shN": (n, k if k in (0, 3, 8, 15) else -1, 3), "label_ids": (n,)}
+    return next((name for name, shape in shapes.items() if tensors[name].shape != shape), None)
 
 
 def relabelled(g: Gaussians, label_of: Mapping[int, int]) -> Gaussians:

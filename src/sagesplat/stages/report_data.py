@@ -300,7 +300,7 @@ def _settings(records: dict[str, dict]) -> list[tuple[str, str]]:
 
 
 def _placeless(text: str) -> str:
-    """The name alone of a path outside of the run, which moving the run does not make wrong; else the text."""
+    """The name of a path outside of the run, which moving the run does not make wrong; of others the text."""
     return Path(text).name if os.path.isabs(text) or text.startswith("../") else text
 
 
