@@ -93,7 +93,7 @@ def report_data(
         plans=list(plans_of(job)),
         evaluation=evaluation_of(job),
         panels=picture_panels(job, composed),
-        scene_facts=describe(scene),
+        scene_facts=[(title, _placeless(text)) for title, text in describe(scene)],
         settings=_settings(records),
         timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
         provenance=_provenance(records),
