@@ -54,9 +54,12 @@ def execute(notebook: dict[str, Any], settings: str | None = None) -> dict[str, 
 def _value(code: str, name: str, names: dict[str, Any]) -> Any:
     """Run a cell; what its last line is, where that is an expression."""
     tree = ast.parse(code)
-    last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
-    exec(compile(tree, name, "exec"), names)
-    return None if last is None else eval(compile(ast.Expression(last.value), name, "eval"), names)
+    last = tree.body[-1] if tree.body else None
+    if not isinstance(last, ast.Expr):
+        exec(compile(tree, name, "exec"), names)
+        return None
+    exec(compile(ast.Module(tree.body[:-1], []), name, "exec"), names)
+    return eval(compile(ast.Expression(last.value), name, "eval"), names)
 
 
 def _result(value: Any, number: int) -> dict[str, Any]:

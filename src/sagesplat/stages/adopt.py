@@ -188,6 +188,7 @@ def _cameras(
 ) -> tuple[Sequence[Camera], np.ndarray, str]:
     """Where to look from, which direction is up there, and what that was decided by."""
     if given:
+        assert config.cameras is not None  # they were read from it
         cameras = [one.camera for one in given]
         return cameras, upward(cameras) * FLIP, f"those of {config.cameras.name}"
     drawn = free_cameras(
