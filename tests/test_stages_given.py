@@ -12,6 +12,7 @@ from conftest import orbit, random_gaussians
 from sagesplat import AdoptConfig, Event, FinishedRun, Gaussians, StageDone, StageSkipped, adopt_splat
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Progress
+from sagesplat.formats.increments import read_index
 from sagesplat.formats.levels import read_level
 from sagesplat.scene.scene import Camera
 from sagesplat.stages import pipeline
@@ -51,6 +52,11 @@ def test_gaussians_and_cameras_become_a_run_that_resumes(tmp_path: Path) -> None
         assert torch.equal(getattr(found, name), tensor[order]), name  # bit by bit, by category
     assert {"car", "tree-merged"} <= set(run.names.values())
     assert str(run) == f"{tmp_path / 'place'}: nested levels, not planned yet"
+    (nest,) = (event for event in events if isinstance(event, StageDone) and event.name == "nest")
+    full = run.costs.transfer_bytes[:, -1].sum()
+    everything = sum(one.nbytes for one in read_index(run.job.run.increments))
+    assert f"takes {full / 1e6:.2f} MB, all together {everything / 1e6:.2f} MB, " in nest.lines[0]
+    assert full < everything
     events.clear()
     adopted(tmp_path / "place", events, cameras=cameras)
     assert {type(event) for event in events} == {StageSkipped}
