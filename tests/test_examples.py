@@ -83,6 +83,7 @@ def test_a_web_page_has_its_bundle_and_what_is_promised(finished, tmp_path):
     page = (tmp_path / "site" / "index.html").read_text()
     assert 'src="scene/?ui=0&target=0.5"' in page
     assert page.count("<td>level ") == 8
+    assert "nan" not in page
     assert (tmp_path / "site" / "scene" / "manifest.json").is_file()
 
 
