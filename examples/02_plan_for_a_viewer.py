@@ -32,11 +32,7 @@ def main() -> None:
     viewer = replace(views[args.view].camera, w2c=w2c)
 
     plan = run.plan_camera(viewer, target_fidelity=args.target_fidelity, target_ssim=args.target_ssim)
-    for choice in plan.choices:
-        print(
-            f"{run.titles[choice.label_id]:24} level {choice.level:3}  {choice.count:9,} Gaussians  "
-            f"distance {choice.distance:6.2f}  at least {choice.predicted:.3f}, {choice.verdict}"
-        )
+    print(plan)  # a row for each category; "predicted" is what it measures at least
     write_ply(args.ply, run.compose(plan), run.names, antialiased=run.antialiased)
     print(f"{args.ply}: {plan.count:,} Gaussians, {plan.transfer_bytes or 0:,} bytes to send")
 

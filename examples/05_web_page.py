@@ -56,7 +56,7 @@ def main() -> None:
     run = open_run(args.run)
     plan = run.plan_camera(run.scene.views[0].camera, target_fidelity=args.target_fidelity)
     rows = "".join(
-        f"<tr><td>{escape(run.titles[choice.label_id])}<td>level {choice.level}<td>{choice.predicted:.2f}"
+        f"<tr><td>{escape(run.titles[choice.label_id])}<td>level {choice.level}<td>{choice.promised}"
         for choice in plan.choices
     )
     args.site.mkdir(parents=True, exist_ok=True)

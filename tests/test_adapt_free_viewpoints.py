@@ -96,7 +96,7 @@ def seen(g: Gaussians, found: FreeViewpoints) -> np.ndarray:
 def test_an_object_is_looked_at_from_around():
     found = free_cameras(BALL, 24)
     assert found.kind == "object"
-    assert found.reason.startswith("object: one is surrounded in")
+    assert found.reason.startswith("object: it encloses ")
     np.testing.assert_allclose(found.centre, [2, 0, 5], atol=0.1)
     assert 0.9 < found.radius < 1.4
     away = (positions(found) - found.centre) / found.radius

@@ -10,7 +10,7 @@ from conftest import Call, random_gaussians, write_capture
 
 from sagesplat import cli
 from sagesplat.cli import help
-from sagesplat.cli.overview import summaries
+from sagesplat.cli.overview import GROUPS, summaries
 from sagesplat.core.names import visible
 
 
@@ -120,6 +120,8 @@ def test_the_overview_loads_no_command() -> None:
 def test_the_overview_is_of_the_commands_that_there_are() -> None:
     first = {name: (function.__doc__ or "").splitlines()[0] for name, function in cli.commands().items()}
     assert list(summaries()) == list(first.items())
+    grouped = [name for names in GROUPS.values() for name in names.split()]
+    assert sorted(grouped) == sorted(first)
 
 
 def test_help_lists_every_command(

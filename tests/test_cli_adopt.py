@@ -64,6 +64,14 @@ def test_its_settings_are_the_defaults_of_the_next_call(finished: Path, command:
     assert "✓" not in said  # nothing is redone
 
 
+def test_its_report_is_right_where_the_run_is_moved(finished: Path) -> None:
+    """Commands are typed in the folder that holds the run, and no path is absolute."""
+    page = (finished / "nested" / "report" / "index.html").read_text()
+    assert str(finished.parent) not in page
+    assert "<code>sagesplat view run</code>" in page
+    assert "typed in the folder that holds the run" in page
+
+
 @pytest.mark.usefixtures("up_to_levels")
 def test_another_splat_replaces_it_only_with_force(finished: Path, tmp_path: Path, command: Call) -> None:
     run = Path(shutil.copytree(finished, tmp_path / "run"))

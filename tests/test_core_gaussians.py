@@ -6,6 +6,7 @@ import pytest
 import torch
 from conftest import random_gaussians
 
+from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians, concat
 
 
@@ -61,3 +62,62 @@ def test_detach_shares_memory_without_a_graph():
     for name, p in detached.parameters().items():
         assert not p.requires_grad
         assert p.data_ptr() == leaves[name].data_ptr()
+
+
+def trained(g: Gaussians) -> torch.nn.ParameterDict:
+    return torch.nn.ParameterDict({name: torch.nn.Parameter(t) for name, t in g.to_gsplat().items()})
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_the_dictionary_of_gsplats_trainer_is_read_and_given_back(degree):
+    g = random_gaussians(7, degree=degree)
+    found = Gaussians.from_gsplat(trained(g), g.label_ids)
+    assert_rows(found, g, list(range(7)))
+    assert not any(tensor.requires_grad for tensor in found.parameters().values())
+    assert set(Gaussians.from_gsplat(trained(g).state_dict()).label_ids.tolist()) == {-1}
+    doubles = {name: tensor.double() for name, tensor in g.to_gsplat().items()}
+    assert torch.equal(Gaussians.from_gsplat(doubles).sh0, g.sh0)
+
+
+def test_its_names_are_gsplats_own(tmp_path):
+    """gsplat writes what it takes by these names; the file holds the same Gaussians."""
+    gsplat = pytest.importorskip("gsplat", minversion="1.5")
+    from sagesplat.formats.splats import read_splat
+
+    g = random_gaussians(7, degree=3)
+    tensors = g.to_gsplat() | {"sh0": g.sh0, "shN": g.shN}
+    gsplat.export_splats(**tensors, format="ply", save_to=str(tmp_path / "gsplat.ply"))
+    found = read_splat(tmp_path / "gsplat.ply").gaussians
+    for name, tensor in g.parameters().items():
+        assert torch.allclose(getattr(found, name), tensor, atol=1e-6), name
+
+
+@pytest.mark.parametrize("prefix", ["", "gauss_params.", "_model.gauss_params."])
+def test_the_dictionary_of_nerfstudio_is_read(prefix):
+    g = random_gaussians(7, degree=3)
+    names = {"sh0": "features_dc", "shN": "features_rest"}
+    shapes = {"sh0": (7, 3), "opacities": (7, 1)}
+    splats = {
+        prefix + names.get(name, name): tensor.reshape(shapes.get(name, tensor.shape))
+        for name, tensor in g.to_gsplat().items()
+    }
+    found = Gaussians.from_gsplat({**splats, "_model.camera_optimizer.pose_adjustment": torch.zeros(3, 6)})
+    for name, tensor in g.parameters().items():
+        assert torch.equal(getattr(found, name), tensor), name
+
+
+def test_what_is_no_3dgs_is_one_line():
+    g = random_gaussians(7, degree=1)
+    for change, says in (
+        (
+            {"scales": g.log_scales[:, :2]},
+            r"splats: scales is of shape \[7, 2\]; give N Gaussians as 3DGS has them",
+        ),
+        ({"shN": torch.zeros(7, 4, 3)}, r"splats: shN is of shape \[7, 4, 3\]"),
+        ({"means": torch.zeros(())}, r"splats: means is of shape \[\]"),
+        ({"sh0": None}, r"splats: no tensors sh0; give gsplat's means"),
+    ):
+        with pytest.raises(DataError, match=says):
+            Gaussians.from_gsplat({**g.to_gsplat(), **change})
+    with pytest.raises(DataError, match="no tensors means, quats, scales, opacities, sh0, shN"):
+        Gaussians.from_gsplat({})

@@ -21,7 +21,7 @@ from tools import doc_tables
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(DOCS.rglob("*.md"))
+PAGES = sorted(path for path in DOCS.rglob("*.md") if path.parent.name != "cli")  # that is generated
 README = ROOT / "README.md"
 FOREIGN = {  # flags of other tools: pip and uv, ruff, Ray, splat-transform, OpenSplat; a placeholder
     *(

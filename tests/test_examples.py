@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from conftest import random_gaussians
 from PIL import Image
 
-from sagesplat import read_ply
+from sagesplat import read_ply, read_splat
 from tools.notebooks import NOTEBOOKS, execute
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -53,7 +55,11 @@ def test_a_plan_for_a_viewer_is_written_and_grows_with_the_target(finished, tmp_
         text = run("02", folder, "view_001.png", ply, "--target-fidelity", target, "--back", 0.01)
         counts.append(int(text.splitlines()[-1].split()[1].replace(",", "")))
         assert len(read_ply(ply)) == counts[-1]
+        assert "vase " in text
     assert 0 < counts[0] < counts[1]
+    far = run("02", folder, "view_001.png", tmp_path / "far.ply", "--back", 1000)
+    assert "no promise" in far
+    assert "nan" not in far
 
 
 def test_a_render_has_the_size_that_was_asked_for(capture, finished, tmp_path):
@@ -69,7 +75,21 @@ def test_a_web_page_has_its_bundle_and_what_is_promised(finished, tmp_path):
     page = (tmp_path / "site" / "index.html").read_text()
     assert 'src="scene/?ui=0&target=0.5"' in page
     assert page.count("<td>level ") == 8
+    assert "nan" not in page
     assert (tmp_path / "site" / "scene" / "manifest.json").is_file()
+
+
+def test_a_splat_of_gsplats_trainer_becomes_levels_that_are_measured(tmp_path):
+    g = random_gaussians(300, degree=1, logit=2.0)
+    splats = torch.nn.ParameterDict({name: torch.nn.Parameter(t) for name, t in g.to_gsplat().items()})
+    torch.save({"step": 1, "splats": splats.state_dict()}, tmp_path / "ckpt.pt")
+    small = ("--views", 14, "--width", 48)
+    text = run("06", tmp_path / "ckpt.pt", tmp_path / "run", tmp_path / "small.spz", *small)
+    for said in ("nest: ", "run: nested levels", "fidelity 0.9 ", "Levels against run level "):
+        assert said in text
+    count = int(text.splitlines()[-1].split()[-2].replace(",", ""))
+    assert 0 < len(read_splat(tmp_path / "small.spz").gaussians) == count <= 300
+    assert (tmp_path / "run" / "measured" / "levels.csv").is_file()
 
 
 SIZES = "VIEWS, WIDTH, HEIGHT, STEPS, NEST_STEPS = 10, 48, 36, 20, 10"
@@ -106,6 +126,18 @@ def test_the_notebook_of_promises(finished, tmp_path, monkeypatch):
     assert "test views" in printed(second)
 
 
+@pytest.mark.slow
+def test_the_notebook_of_levels_of_a_splat(finished, tmp_path, monkeypatch):
+    shutil.copytree(finished[0], tmp_path / "runs" / "first")
+    monkeypatch.chdir(tmp_path)
+    third = notebook("03_levels_of_your_splat.ipynb")
+    names = execute(third, "RUN, SIZE, VIEWS = 'runs/first', (64, 48), 14")
+    assert torch.equal(names["gaussians"].means, names["full"].means)
+    assert "Levels against adopted level " in printed(third)
+    assert third["cells"][-1]["outputs"][0]["data"]["text/plain"] == [repr(names["run"].show())]
+    assert Path("planned.sog").stat().st_size > 0
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -113,6 +145,7 @@ def test_the_notebook_of_promises(finished, tmp_path, monkeypatch):
         ("02", ("absent", "a.png", "out.ply")),
         ("03", ("absent.ply", "absent", "a.png", "out.png")),
         ("05", ("absent", "site")),
+        ("06", ("absent.ply", "run", "out.ply")),
     ],
 )
 def test_what_is_not_there_is_one_line(name, words, tmp_path, capfd):

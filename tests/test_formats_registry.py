@@ -41,6 +41,11 @@ def test_other_names_are_refused(tmp_path):
         write_splat(tmp_path / "a.ksplat", random_gaussians(3))
     with pytest.raises(DataError, match=r"several levels; name a \.ply, .* or \.splat"):
         write_splat(tmp_path / "lod-meta.json", random_gaussians(3))
+    for name in ("a.html", "a.HTM"):  # what people try for a page
+        with pytest.raises(
+            DataError, match=rf"{name}: a page .* `sagesplat bundle RUN .* --single-file` writes"
+        ):
+            write_splat(str(tmp_path / name), random_gaussians(3))
     assert list(tmp_path.iterdir()) == []
 
 

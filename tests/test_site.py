@@ -16,6 +16,7 @@ from page_checks import wrong_with
 
 import sagesplat
 from sagesplat import cli
+from sagesplat.cli.help import flags_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -69,10 +70,16 @@ def test_links_pictures_and_anchors_lead_somewhere(site):
 
 @pytest.mark.parametrize("site", ["basic"], indirect=True, scope="module")
 def test_every_command_and_public_name_is_in_the_reference(site):
-    commands = Page((site / "reference/cli.html").read_text()).anchors
-    assert {f"sagesplat-{name}" for name in cli.commands()} <= commands
-    names = Page((site / "reference/python.html").read_text()).anchors
-    assert {f"sagesplat.{name}" for name in sagesplat.__all__} <= names
+    pages = {f"cli/{name}.html": name for name in cli.commands()}
+    assert set(pages) <= Page((site / "reference/cli.html").read_text()).links
+    for page, name in pages.items():
+        anchors = Page((site / "reference" / page).read_text()).anchors
+        flags = [flag.name for flag in flags_of(cli.commands()[name]) if flag.name.startswith("--")]
+        assert len([one for one in anchors if one.startswith(f"cmdoption-sagesplat-{name}")]) >= len(flags)
+    python = Page((site / "reference/python.html").read_text())
+    assert {f"sagesplat.{name}" for name in sagesplat.__all__} <= python.anchors
+    for kind in sagesplat.Event.__args__:
+        assert any(one.endswith(f".{kind.__name__}") for one in python.links), "Event links to its kinds"
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,14 @@
 """What scripts call gives what the commands give."""
 
 import math
+import re
 from dataclasses import replace
+from html import unescape
 
+import browser as chromium
 import pytest
 import torch
-from conftest import DemoRun
+from conftest import DemoRun, wait_for
 
 from sagesplat import (
     FinishedRun,
@@ -125,3 +128,59 @@ def test_a_composition_is_what_the_run_wrote(runs, ladder):
     assert torch.equal(run.compose(plan.levels).label_ids, written.label_ids)
     assert set(run.names) >= set(plan.levels)
     assert [plan.target for plan in run.plans] == [0.3, 0.4, 0.5]
+
+
+@pytest.mark.parametrize("ladder", ["nested", "snapshots"])
+def test_a_printed_run_lists_its_plans_and_a_plan_its_categories(runs, ladder):
+    run = runs[ladder]
+    first, head, *rows = str(run).splitlines()
+    assert first == f"{run.path}: {ladder} levels"
+    assert head.split() == ["plan", "MB", "Gaussians", "status"]
+    assert [row.split()[:2] for row in rows] == [["SSIM", "0.3"], ["SSIM", "0.4"], ["SSIM", "0.5"]]
+    assert repr(run) == f"FinishedRun({str(run.path)!r})"
+    plan = run.plans[1]
+    first, _, *rows = str(plan).splitlines()
+    assert first == "Plan for SSIM 0.4"
+    assert len(rows) == len(plan.choices) + 1
+    for choice, row in zip(plan.choices, rows, strict=False):
+        assert row.startswith(f"{run.titles[choice.label_id]} ")
+        assert f"{choice.count:,}" in row
+    assert rows[-1].startswith("all ")
+    assert "nan" not in str(plan)
+    assert repr(plan).startswith("<Plan for SSIM 0.4: ")
+    assert "category 3" in str(replace(plan, titles={}, choices=(replace(plan.choices[0], label_id=3),)))
+
+
+def test_a_plan_of_a_camera_knows_the_names_too_and_files_hold_none(runs):
+    run = runs["nested"]
+    assert run.plan_camera(run.scene.views[0].camera).titles == run.titles
+    scene_plans, _ = read_plans(run.job.run.plan)
+    assert scene_plans[0].titles == {}
+    assert "titles" not in run.job.run.plan.read_text()
+
+
+def test_a_notebook_shows_the_single_page_of_the_run(runs, tmp_path):
+    run = runs["nested"]
+    shown = run.show(height=300)
+    html = shown._repr_html_()
+    (page,) = re.findall(
+        r'<iframe [^>]*style="width:100%;height:300px;[^>]* srcdoc="([^"]*)"></iframe>', html
+    )
+    run.bundle(tmp_path / "scene.html", single_file=True)
+    assert unescape(page) == (tmp_path / "scene.html").read_text(encoding="utf-8")
+    assert str(run.path) in repr(shown)
+    assert len(repr(shown)) < 300
+    with pytest.raises(ValueError, match="a height of 9 px cannot be used"):
+        run.show(height=9)
+
+
+@pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing()))
+def test_the_viewer_in_a_notebook_draws(runs, tmp_path):
+    cell = runs["nested"].show()._repr_html_()
+    (tmp_path / "notebook.html").write_text(f"<!doctype html><title>cell</title>{cell}", encoding="utf-8")
+    with chromium.open_page((tmp_path / "notebook.html").as_uri(), (480, 500)) as opened:
+        frame = opened.page.frames[-1]
+        drawn = "document.querySelector('canvas') && window.sagesplat.state().bytesShown > 0"
+        wait_for(lambda: frame.evaluate(f"window.sagesplat?.state ? {drawn} : false"))
+        ours = [said for said in opened.complaints if "xr-spatial-tracking" not in said]  # of file: alone
+        assert ours == []

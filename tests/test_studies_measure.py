@@ -1,6 +1,7 @@
 """Levels of anybody against their scene: files, streamed SOG, bundles and runs; tables, picture and files."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from conftest import orbit, random_gaussians
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.viewpoints import Rule, Viewpoints, write_viewpoints
 from sagesplat.core.config import MeasureConfig
-from sagesplat.core.events import Event, TableMade, Warned
+from sagesplat.core.errors import RunError
+from sagesplat.core.events import Emit, Event, TableMade, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_increments, read_index, shown
 from sagesplat.formats.ply import write_ply
@@ -24,8 +26,8 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.stages.bundle import bundle
 from sagesplat.studies.measure import report, run, score
 from sagesplat.studies.measure.levels import levels_of
-from sagesplat.studies.measure.report import levels_table
-from sagesplat.studies.measure.run import measure
+from sagesplat.studies.measure.report import Measured, levels_table
+from sagesplat.studies.measure.run import measure_levels
 from sagesplat.studies.measure.score import COVERED
 from tests.fuzz.readers.foreign_splats import put_sog, sog, streamed
 
@@ -51,6 +53,12 @@ def files(tmp_path: Path) -> Path:
     drawn = Viewpoints(Rule(), "capture", 50.0, tuple(orbit(VIEWS)), ("fit",) * VIEWS)
     write_viewpoints(tmp_path / "views.json", drawn)
     return tmp_path
+
+
+def measure(
+    paths: Sequence[Path | Gaussians], out: Path, config: MeasureConfig, emit: Emit = lambda event: None
+) -> Measured:
+    return measure_levels(paths[0], paths[1:], out, config, on_event=emit, threads=1)
 
 
 def third() -> Gaussians:
@@ -193,3 +201,24 @@ def test_the_command(files, monkeypatch, command):
     code, _ = command("measure", *words)
     assert code == 0
     assert (files / "measure" / "levels.csv").is_file()
+
+
+def test_gaussians_of_a_script_are_measured_as_their_files_are(files: Path) -> None:
+    by_path = measure([files / "full.ply", files / "third.ply"], files / "out", settings(files))
+    given = measure([FULL, third()], files / "again", settings(files))
+    assert [row.ssim for row in given.of(0, TOTAL)] == [row.ssim for row in by_path.of(0, TOTAL)]
+    assert (given.reference, list(given.names), list(given.nbytes)) == ("reference", ["level 1"], [50 * 248])
+    mixed = measure_levels(FULL, str(files / "third.ply"), files / "mixed", settings(files), threads=1)
+    assert list(mixed.names) == ["third.ply"]
+    with pytest.raises(RunError, match=r"^reference: one level, and nothing to compare it with"):
+        measure([FULL], files / "out", settings(files))
+
+
+def test_printed_it_is_a_row_for_each_level(files: Path) -> None:
+    found = measure([FULL, third(), FULL], files / "out", settings(files))
+    title, head, *rows = str(found).splitlines()
+    assert title == f"Levels against reference, means over {VIEWS} viewpoints"
+    assert head.split() == ["level", "Gaussians", "MB", "SSIM", "PSNR", "worst", "SSIM"]
+    assert [row.split()[:3] for row in rows] == [["level", "1", "50"], ["level", "2", "150"]]
+    assert len({len(line) for line in (head, *rows)}) == 1
+    assert repr(found) == f"<measured: level 1, level 2 at {VIEWS} viewpoints>"

@@ -1,8 +1,9 @@
 """Run the notebooks of examples/ and keep what they print and draw: python tools/notebooks.py [NAME.ipynb]
 
-They run in a folder of their own under /tmp, one after the other: the second uses the run of the first.
+They run in a folder of their own under /tmp, one after the other: later ones use the run of the first.
 """
 
+import ast
 import base64
 import contextlib
 import io
@@ -34,10 +35,12 @@ def execute(notebook: dict[str, Any], settings: str | None = None) -> dict[str, 
         printed = io.StringIO()
         code = settings if settings and number == 1 else "".join(cell["source"])
         with contextlib.redirect_stdout(printed):
-            exec(compile(code, f"cell {number}", "exec"), names)
+            value = _value(code, f"cell {number}", names)
         cell["execution_count"] = number
         text = printed.getvalue().splitlines(keepends=True)
         cell["outputs"] = [{"output_type": "stream", "name": "stdout", "text": text}] if text else []
+        if value is not None:
+            cell["outputs"].append(_result(value, number))
         for figure in pyplot.get_fignums():
             jpeg = io.BytesIO()
             pyplot.figure(figure).savefig(jpeg, format="jpeg", dpi=80, bbox_inches="tight")
@@ -46,6 +49,25 @@ def execute(notebook: dict[str, Any], settings: str | None = None) -> dict[str, 
             cell["outputs"].append(output)
         pyplot.close("all")
     return names
+
+
+def _value(code: str, name: str, names: dict[str, Any]) -> Any:
+    """Run a cell; what its last line is, where that is an expression."""
+    tree = ast.parse(code)
+    last = tree.body[-1] if tree.body else None
+    if not isinstance(last, ast.Expr):
+        exec(compile(tree, name, "exec"), names)
+        return None
+    exec(compile(ast.Module(tree.body[:-1], []), name, "exec"), names)
+    return eval(compile(ast.Expression(last.value), name, "eval"), names)
+
+
+def _result(value: Any, number: int) -> dict[str, Any]:
+    """What a notebook shows of a value, without pages of megabytes: they are made, and left out."""
+    if hasattr(value, "_repr_html_"):
+        value._repr_html_()
+    data = {"text/plain": repr(value).splitlines(keepends=True)}
+    return {"output_type": "execute_result", "execution_count": number, "metadata": {}, "data": data}
 
 
 def main() -> None:

@@ -54,6 +54,7 @@ EXCEPTIONS: dict[str, str] = {
     "run.ray_cluster:_check_answers": "nine bytes, of which one is compared",
     "run.remote:run_part": _HASHED,
     "run.stage:run_stages": _WROTE,
+    "stages.api:FinishedRun.show": _WROTE,
     "stages.adopt:_label": "by read_header and read_level, which the readers run",
     "stages.adopt:_make_capture": _WROTE,
     "stages.live_bundle:_live_bundle": OURS,

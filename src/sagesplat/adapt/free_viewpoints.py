@@ -116,7 +116,7 @@ def free_cameras(
             "give cameras, or --up and another kind"
         )
     wanted = "" if len(cameras) == count else f"; {len(cameras)} of {count} viewpoints see enough"
-    how = "as asked" if kind != "auto" else f"one is surrounded in {share:.0%} of the free space within"
+    how = "as asked" if kind != "auto" else f"it encloses {share:.0%} of the free space within it"
     centre = cloud.world(drawer.centre[None])[0]
     reason = f"{decided}: {how}; {upward.reason}{wanted}"
     return FreeViewpoints(cameras, decided, upward.up, centre, drawer.radius * cloud.unit, reason)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from sagesplat.adapt.eq3 import SsimModel
@@ -11,6 +11,7 @@ from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 from sagesplat.core.gaussians import BYTES_PER_GAUSSIAN, Gaussians
 from sagesplat.core.limits import Count, LabelId, NotNegative, NumberOrNaN, Share, StepNumber
+from sagesplat.core.text_table import aligned
 
 Models = Mapping[tuple[int, int], SsimModel]  # by (label id, level)
 Counts = Mapping[tuple[int, int], int]  # Gaussians of each (label id, level)
@@ -58,6 +59,16 @@ class Choice:
         return self.count * BYTES_PER_GAUSSIAN
 
     @property
+    def sizes(self) -> tuple[str, str]:
+        """Megabytes, to send where increments are, and Gaussians, for people."""
+        return _sizes(self.nbytes if self.transfer_bytes is None else self.transfer_bytes, self.count)
+
+    @property
+    def promised(self) -> str:
+        """What is predicted of the quality, for people: a dash where nothing is."""
+        return "–" if math.isnan(self.predicted) else f"{self.predicted:.3f}"
+
+    @property
     def verdict(self) -> str:
         """The status for people, with what is missing to a proof."""
         return f"{self.status}, uncalibrated" if self.calibrated is False else self.status
@@ -65,7 +76,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Plan:
-    """One level per category, for one view or for a whole scene."""
+    """One level per category, for one view or for a whole scene; `print` lists the categories."""
 
     target: NumberOrNaN  # quality that every category is to reach; NaN for a plan within a budget
     view: Count | None  # row in Scene.views; None = the scene
@@ -76,6 +87,24 @@ class Plan:
     fits: bool = True  # whether it keeps the budget
     quality: QualityKind = "ssim"  # of which it is the target
     cells: dict[int, int] | None = None  # level by cell id; None: that of the category
+    titles: Mapping[int, str] = field(default_factory=dict, compare=False)  # names for people, where known
+
+    def __repr__(self) -> str:
+        megabytes, count = self.sizes
+        return f"<Plan for {self.asked}: {megabytes} MB, {count} Gaussians, {self.verdict}>"
+
+    def __str__(self) -> str:
+        megabytes, count = self.sizes
+        rows = [
+            (
+                self.titles.get(c.label_id, f"category {c.label_id}"), str(c.level), *c.sizes, c.promised,
+                c.verdict,
+            )
+            for c in self.choices
+        ]  # fmt: skip
+        rows.append(("all", "", megabytes, count, "", self.verdict))
+        header = ("category", "level", "MB", "Gaussians", "predicted", "status")
+        return f"Plan for {self.asked}\n{aligned(header, rows, right=(1, 2, 3, 4))}"
 
     @property
     def levels(self) -> dict[int, int]:
@@ -109,6 +138,11 @@ class Plan:
         """Bytes of the increments to send; None for recorded levels."""
         sizes = [choice.transfer_bytes for choice in self.choices]
         return None if None in sizes else sum(size for size in sizes if size is not None)
+
+    @property
+    def sizes(self) -> tuple[str, str]:
+        """Megabytes, to send where increments are, and Gaussians, for people."""
+        return _sizes(self.nbytes if self.transfer_bytes is None else self.transfer_bytes, self.count)
 
     @property
     def status(self) -> str:
@@ -147,6 +181,10 @@ class Plan:
         """The category whose prediction is lowest against the target; None without any model."""
         predicted = [c for c in self.choices if not math.isnan(c.predicted)]
         return min(predicted, key=lambda c: c.predicted).label_id if predicted else None
+
+
+def _sizes(nbytes: int, count: int) -> tuple[str, str]:
+    return f"{nbytes / 1e6:,.2f}", f"{count:,}"
 
 
 def quality_title(quality: QualityKind) -> str:

@@ -56,7 +56,7 @@ def _to_json(plan: Plan) -> dict[str, Any]:
         | {"nbytes": choice.nbytes}
         for choice in plan.choices
     ]
-    own = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "choices"}
+    own = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name not in ("choices", "titles")}
     own["target"] = None if math.isnan(plan.target) else plan.target
     totals = {n: getattr(plan, n) for n in ("count", "nbytes", "transfer_bytes", "status", "binding")}
     return {**own, **totals, "choices": choices}

@@ -6,16 +6,29 @@ import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
-FILES = ("stages.py", "studies.py", "tools.py")  # in the order in which their commands are listed
+FILES = ("stages.py", "studies.py", "tools.py")
+GROUPS = {
+    "Make a scene with levels": "demo run adopt plan labels instances clean",
+    "Look at it": "info view report",
+    "Share it": "bundle export",
+    "Measure": "measure evaluate compare",
+    "Research": "sweep crossview transfer early-stopping",
+    "One stage of a run at a time": "masks lift fuse train nest observe sample fit compose",
+    "This machine": "doctor download completion",
+}
+"""Titles and commands, as both are listed: what one wants first, stages of their own last."""
 
 
 def overview() -> str:
-    """All commands, each with the first line of its docstring."""
+    """All commands by what one wants, each with the first line of its docstring."""
     width = max(60, min(110, shutil.get_terminal_size().columns))
-    lines = ["usage: sagesplat COMMAND ...", "", "Semantic-driven adaptive Gaussian splatting.", ""]
-    for name, text in summaries():
-        entry = f"  {name:18}{text}"
-        lines += textwrap.wrap(entry, width, subsequent_indent=" " * 20, drop_whitespace=True)
+    lines = ["usage: sagesplat COMMAND ...", "", "Semantic-driven adaptive Gaussian splatting."]
+    about = dict(summaries())
+    for title, names in GROUPS.items():
+        lines += ["", title]
+        for name in names.split():
+            entry = f"  {name:18}{about[name]}"
+            lines += textwrap.wrap(entry, width, subsequent_indent=" " * 20, drop_whitespace=True)
     return "\n".join([*lines, "", "`sagesplat COMMAND --help` lists the options of a command."])
 
 

@@ -1,5 +1,6 @@
 """Commands that compare methods, scenes, settings and viewpoints."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +17,6 @@ from sagesplat.cli.base import (
     command,
     computing,
     open_job,
-    prepare,
 )
 from sagesplat.cli.say import say
 from sagesplat.core.config import CompareConfig, MeasureConfig
@@ -138,11 +138,10 @@ def measure(
         out: folder for tables, curves and a contact sheet of the viewpoints
     """
     from sagesplat.cli.console import Console
-    from sagesplat.studies.measure.run import measure as measure_levels
+    from sagesplat.studies.measure.run import measure_levels
 
-    backend, _ = prepare(Machine(**vars(device)))
     with Console() as console:
-        measure_levels([reference, *levels], out, measure, console, backend)
+        measure_levels(reference, levels, out, measure, on_event=console, **asdict(device))
     say(out)
 
 

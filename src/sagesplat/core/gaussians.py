@@ -7,9 +7,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sagesplat.core.errors import DataError
+
 BYTES_PER_GAUSSIAN = 248  # 62 float32, as in INRIA's PLY: the model size that the paper counts
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+# of the same tensors: what gsplat's trainers call them, and nerfstudio's where those differ
+_GSPLAT = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacities", "sh0", "shN"), strict=True))
+_NERFSTUDIO = {"sh0": "features_dc", "shN": "features_rest"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +76,65 @@ class Gaussians:
         """The same Gaussians on a device; tensors already there are shared."""
         return Gaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
+    @classmethod
+    def from_gsplat(
+        cls, splats: Mapping[str, Tensor], label_ids: Int[Tensor, " N"] | None = None
+    ) -> "Gaussians":
+        """The Gaussians of a training with gsplat or nerfstudio, as they are before any activation.
+
+        Args:
+            splats: What gsplat's trainers call `splats` (a `ParameterDict` or a checkpoint's dictionary):
+                "means" [N, 3], "scales" [N, 3] (natural log), "quats" [N, 4] (wxyz, any length but zero),
+                "opacities" [N] (logit), "sh0" [N, 1, 3], "shN" [N, K, 3] with K = 0, 3, 8 or 15. Or the
+                `gauss_params` of nerfstudio's splatfacto: "features_dc" [N, 3] and "features_rest" in place
+                of the last two, "opacities" [N, 1]; with sh_degree 0 its colours are no harmonics. Keys may
+                have a prefix that ends in a dot, as in a checkpoint; others are left alone.
+            label_ids: Category ids, -1: unlabelled (default: all are unlabelled).
+
+        Returns:
+            float32 tensors on the device of "means", detached; shared where they are float32 already.
+
+        Raises:
+            DataError: For missing tensors and other shapes, such as the two scales of 2DGS.
+
+        Example:
+            >>> import torch
+            >>> from sagesplat import Gaussians
+            >>> z = torch.zeros
+            >>> splats = {"means": z(5, 3), "scales": z(5, 3), "quats": z(5, 4) + 1, "opacities": z(5)}
+            >>> g = Gaussians.from_gsplat({**splats, "sh0": z(5, 1, 3), "shN": z(5, 15, 3)})
+            >>> len(g), g.sh_degree, sorted(g.to_gsplat())
+            (5, 3, ['means', 'opacities', 'quats', 'scales', 'sh0', 'shN'])
+        """
+        given = {str(key).rpartition(".")[2]: value for key, value in splats.items()}
+        names = _GSPLAT | (_NERFSTUDIO if "features_dc" in given else {})
+        if missing := [name for name in names.values() if not isinstance(given.get(name), Tensor)]:
+            raise DataError(
+                f"splats: no tensors {', '.join(missing)}; give gsplat's means, scales, quats, opacities, "
+                "sh0 and shN, or nerfstudio's gauss_params"
+            )
+        tensors = {own: given[name].detach() for own, name in names.items()}
+        device, count = tensors["means"].device, tensors["means"].shape[0] if tensors["means"].ndim else 0
+        if tensors["logit_opacities"].shape == (count, 1):
+            tensors["logit_opacities"] = tensors["logit_opacities"][:, 0]
+        if tensors["sh0"].shape == (count, 3):
+            tensors["sh0"] = tensors["sh0"][:, None]
+        labels = torch.full((count,), -1) if label_ids is None else label_ids
+        tensors = {name: tensor.to(device, torch.float32) for name, tensor in tensors.items()}
+        tensors["label_ids"] = labels.to(device, torch.int16)
+        if misfit := _misfit(tensors):
+            shape = list(tensors[misfit].shape)
+            name = names.get(misfit, misfit)
+            raise DataError(f"splats: {name} is of shape {shape}; give N Gaussians as 3DGS has them")
+        return cls(**tensors)
+
+    def to_gsplat(self) -> dict[str, Tensor]:
+        """The tensors by the names of gsplat's trainers, as `from_gsplat` takes them; shared, no copies.
+
+        `torch.nn.ParameterDict(g.to_gsplat())` is what a training with gsplat goes on from.
+        """
+        return {name: getattr(self, own) for own, name in _GSPLAT.items()}
+
     def detach(self) -> "Gaussians":
         """The same Gaussians, detached from the autograd graph."""
         return replace(self, **{name: p.detach() for name, p in self.parameters().items()})
@@ -78,15 +142,20 @@ class Gaussians:
 
 def checked(g: Gaussians) -> Gaussians:
     """`g` itself; ValueError unless its tensors have the shapes and types above."""
-    n, k = len(g.logit_opacities), g.shN.shape[1] if g.shN.ndim == 3 else -1
-    shapes = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "logit_opacities": (n,)}
-    shapes |= {"sh0": (n, 1, 3), "shN": (n, k, 3), "label_ids": (n,)}
-    for name, shape in shapes.items():
-        if getattr(g, name).shape != shape or k not in (0, 3, 8, 15):
-            raise ValueError(f"{name} is of shape {list(getattr(g, name).shape)}")
+    if misfit := _misfit({f.name: getattr(g, f.name) for f in fields(g)}):
+        raise ValueError(f"{misfit} is of shape {list(getattr(g, misfit).shape)}")
     if any(p.dtype != torch.float32 for p in g.parameters().values()) or g.label_ids.dtype != torch.int16:
         raise ValueError("parameters are not float32, or label_ids not int16")
     return g
+
+
+def _misfit(tensors: Mapping[str, Tensor]) -> str | None:
+    """The name of a tensor that does not have the shape that the others ask for; None: all fit."""
+    opacities, shN = tensors["logit_opacities"], tensors["shN"]
+    n, k = opacities.shape[0] if opacities.ndim else -1, shN.shape[1] if shN.ndim == 3 else -1
+    shapes = {"logit_opacities": (n,), "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3)}
+    shapes |= {"sh0": (n, 1, 3), "shN": (n, k if k in (0, 3, 8, 15) else -1, 3), "label_ids": (n,)}
+    return next((name for name, shape in shapes.items() if tensors[name].shape != shape), None)
 
 
 def relabelled(g: Gaussians, label_of: Mapping[int, int]) -> Gaussians:

@@ -131,27 +131,55 @@ def writer_of(path: Path) -> SplatWriter:
     """How files of this name are written; DataError for a name that says no format."""
     suffixes = [name for name in WRITERS if name.startswith(".") and path.name.lower().endswith(name)]
     writer = WRITERS.get(path.name) or WRITERS.get(max(suffixes, key=len, default=""))
+    if path.suffix.lower() in (".html", ".htm"):
+        raise DataError(
+            f"{path}: a page is no splat file; `sagesplat bundle RUN {path} --single-file` writes a page "
+            "with the viewer in it"
+        )
     if writer is None or not path.stem:
         raise DataError(f"{path}: its name says no format that is written; use {_listed(WRITERS)}")
     return writer
 
 
 def write_splat(
-    path: Path,
-    g: Gaussians,
+    path: Path | str,
+    gaussians: Gaussians,
     names: Mapping[int, str] | None = None,
     *,
     parents: Mapping[int, str] | None = None,
     antialiased: bool = False,
     offset: Position = NO_OFFSET,
 ) -> None:
-    """Write Gaussians in the format that the suffix says (`registry.WRITERS`), with their labels and `names`.
+    """Write Gaussians in the format that the suffix of a path says, with their labels; `read_splat` reads it.
 
-    `parents` are the names of the categories that instances are of, by label id; `offset` is to be added to
-    all positions, and is written beside the file. `read_splat` finds all of it again. DataError for another
-    suffix, one of a format of several levels, and what the formats cannot hold.
+    Args:
+        path: A .ply, .compressed.ply, .spz, .sog, .glb or .splat; replaced if it is there.
+        gaussians: N Gaussians on any device.
+        names: Category names by label id. With the labels they go into the file where its format has a place
+            for them, else into one beside it, PATH.labels.json.
+        parents: Names of the categories that instances are of, by the instance's label id.
+        antialiased: Whether the scene was trained so.
+        offset: What is to be added to all positions for those of the capture, written beside the file.
+
+    Raises:
+        DataError: For another suffix, lod-meta.json, which holds several levels, and what the format cannot
+            hold.
+        OSError: If a file cannot be written.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from pathlib import Path
+        >>> from sagesplat import Gaussians, read_splat, write_splat
+        >>> z = torch.zeros
+        >>> ids = torch.zeros(5, dtype=torch.int16)
+        >>> g = Gaussians(z(5, 3), z(5, 4) + 1, z(5, 3), z(5), z(5, 1, 3), z(5, 3, 3), ids)
+        >>> path = Path(tempfile.mkdtemp()) / "scene.spz"
+        >>> write_splat(path, g, {0: "tree"})
+        >>> read_splat(path).names
+        {0: 'tree'}
     """
-    scene_writer(path)(path, g, names or {}, parents or {}, antialiased)
+    path = Path(path)
+    scene_writer(path)(path, gaussians, names or {}, parents or {}, antialiased)
     write_offset(path, offset)
 
 

@@ -15,7 +15,7 @@ FAITHFUL = 0.9  # SSIM of training photos below which longer training helps
 
 @dataclass(frozen=True)
 class Commands:
-    """What the commands of a report name, as they are typed in a shell."""
+    """What the commands of a report name, as they are typed in a shell in the folder that holds the run."""
 
     run: str  # the run folder
     capture: str = ""  # the capture; empty: none to train on

@@ -91,6 +91,7 @@ def _headline(data: ReportData) -> dict:
     full_mb = sum(tables.last_counts(sizes_of(data)).values()) / MB
     saved = 1 - mb / full_mb if full_mb else 0.0
     shares = [c.reached for c in plan.choices if c.reached]
+    kept, num_views = _kept(plan, rows), len(np.unique(whole.view))
     return {
         "plan": plan,
         "quality": quality_title(plan.quality),
@@ -105,8 +106,9 @@ def _headline(data: ReportData) -> dict:
         "full_ssim": tables.mean(whole.full_ssim),
         "full_psnr": tables.mean(whole.full_psnr),
         **{f.name: tables.mean(getattr(whole, f.name)) for f in fields(whole) if f.name.endswith(COLOURS)},
-        "num_views": len(np.unique(whole.view)),
-        "kept": _kept(plan, rows),
+        "num_views": num_views,
+        "kept": kept,
+        "left_out": _left_out(rows, len(plan.choices) * num_views, kept),
         "least": min(shares, key=lambda share: share.share) if shares else None,
         "num_drawn": max((share.num_views for share in shares), default=0),
         "infeasible": [c for c in plan.choices if c.status == "infeasible"],
@@ -123,6 +125,17 @@ def _kept(plan: Plan, rows: Evaluation) -> tables.Kept:
         known = np.isin(rows.label_id, [c.label_id for c in plan.choices if c.status == "ok"])
         rows = replace(rows, predicted=np.where(known, np.float32(np.inf), np.float32(np.nan)))
     return tables.promise_kept(rows.of_own_quality())
+
+
+def _left_out(rows: Evaluation, possible: int, kept: tables.Kept) -> str:
+    """Why fewer than all pairs of a category and a view are counted, in words."""
+    measured = int((np.isfinite(rows.of_own_quality().ssim) & (rows.label_id != TOTAL)).sum())
+    reasons = [
+        (possible - measured, "that show too little of a category to measure it"),
+        (measured - kept.promised, "without a promise for it"),
+    ]
+    told = [f"{count} {reason}" for count, reason in reasons if count > 0]
+    return f" (not counted: {', '.join(told)})" if told else ""
 
 
 def _categories(data: ReportData, plan: Plan, labels: Sequence[int]) -> list[dict]:

@@ -54,6 +54,7 @@ class RunDir:
     geometry = _In("geometry.npz")  # cameras and points: results can be shown without the capture
     capture = _In("capture")  # the folder of the capture that was made of photos without poses
     adopted = _In("adopted.npz")  # the Gaussians of a splat that somebody else trained, as they were read
+    from_python = _In("from_python")  # a splat and cameras that a script gave, as files, to be adopted
     contact_sheet = _In("viewpoints.png")  # pictures from the viewpoints of an adopted splat
     edited = _In("edited.json")  # of a run made by editing labels: the edits, and settings of its categories
 

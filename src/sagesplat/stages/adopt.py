@@ -91,7 +91,9 @@ def _check_run(run: RunDir, config: AdoptConfig) -> None:
     check_not_edited(run)
     if run.scene.exists() and not run.adopted.exists():
         raise RunError(f"{run.path}: holds a run of its own; choose a new folder for the splat")
-    if config.cameras is not None and config.cameras.resolve().is_relative_to(run.path.resolve()):
+    cameras = None if config.cameras is None else config.cameras.resolve()
+    ours = cameras is not None and cameras.is_relative_to(run.path.resolve())
+    if ours and not cameras.is_relative_to(run.from_python.resolve()):
         raise RunError(
             f"{config.cameras}: in the run folder, where adopt writes; copy it elsewhere, and give that path"
         )
@@ -129,7 +131,7 @@ def _make_capture(
         if photos and config.cameras:
             views = list(load_scene(config.cameras, **reading(scene)).views)
             cameras = [view.camera for view in views]
-            up, how = upward(cameras) * FLIP, f"those of {config.cameras}"
+            up, how = upward(cameras) * FLIP, f"those of {config.cameras.name}"
         else:
             cameras, up, how = _cameras(job, splat, given, config)
             views = _views(own, cameras)
@@ -186,8 +188,9 @@ def _cameras(
 ) -> tuple[Sequence[Camera], np.ndarray, str]:
     """Where to look from, which direction is up there, and what that was decided by."""
     if given:
+        assert config.cameras is not None  # they were read from it
         cameras = [one.camera for one in given]
-        return cameras, upward(cameras) * FLIP, f"those of {config.cameras}"
+        return cameras, upward(cameras) * FLIP, f"those of {config.cameras.name}"
     drawn = free_cameras(
         splat.gaussians, config.views, up=splat.up if config.up == "auto" else config.up, fov=config.fov,
         size=config.size, seed=config.seed, kind=config.kind, backend=job.backend,

@@ -15,7 +15,7 @@ from sagesplat.adapt.renders import Renders
 from sagesplat.core.config import AdoptConfig, NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import read_increments
+from sagesplat.formats.increments import full_scene, read_increments
 from sagesplat.formats.levels import write_set
 from sagesplat.formats.stream_header import AS_GIVEN, Precision, rounded
 from sagesplat.formats.stream_increments import write_streams
@@ -206,7 +206,8 @@ def _write(
     if not lossless and (other := sum(one.format != "stream" for one in made.increments)):
         job.emit(Warned(f"{other} files are PLY: some of their Gaussians lie too far off to be rounded"))
     write_cells(run.cells, describe_cells(sent, dict(label_of)))
-    size, files = sum(one.nbytes for one in made.increments), len({one.uri for one in made.increments})
+    everything = sum(one.nbytes for one in made.increments)
+    shown = sum(one.nbytes for one in full_scene(made.increments))
     if ssim < _KEPT and not lossless:
         job.emit(
             Warned(f"rounding costs {1 - ssim:.4f} of SSIM; --lossless keeps the last level as it came in")
@@ -214,8 +215,8 @@ def _write(
     loss = f"SSIM {ssim:.5f}, PSNR {decibels:.1f} dB to what came in"
     loss = "as it came in" if np.isinf(decibels) else loss
     return [
-        f"{levels} levels, {num_lower} of them of merged Gaussians; "
-        f"{size / 1e6:.2f} MB in {files} file{'s' if files > 1 else ''}",
+        f"{levels} levels, {num_lower} of them of merged Gaussians; the last one takes {shown / 1e6:.2f} MB, "
+        f"all together {everything / 1e6:.2f} MB, since merged levels are replaced",
         f"{len(sent):,} Gaussians, {len(top):,} of them at the last level: {loss}",
     ]
 

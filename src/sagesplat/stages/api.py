@@ -1,22 +1,25 @@
 """What a script calls: the whole pipeline on a capture, and the results of a finished run.
 
-`import sagesplat` exports these names. They do what the commands `sagesplat run`, `plan` and `compose` do.
+`import sagesplat` exports these names. They do what the commands `sagesplat run`, `adopt`, `plan`, `compose`
+and `bundle` do.
 """
 
-from collections.abc import Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from sagesplat.adapt.bound_plans import Costs
 from sagesplat.adapt.cell_models import FidelityModel
 from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.viewpoint import ViewModel
-from sagesplat.core.config import LadderKind, PlanConfig, RunConfig
+from sagesplat.core.config import AdoptConfig, LadderKind, PlanConfig, RunConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Event
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.core.text_table import aligned
 from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.run_dir import RunDir, check_links
@@ -24,10 +27,12 @@ from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.display_names import titles
 from sagesplat.stages import label_edits, pipeline
 from sagesplat.stages.bundle import BundleMade, bundle
+from sagesplat.stages.given import write_given_cameras, write_given_splat
 from sagesplat.stages.method import Method
 from sagesplat.stages.methods import NestedLevels, method_of
 from sagesplat.stages.plan import check_targets
 from sagesplat.stages.results import plans_of
+from sagesplat.viewer.notebook import NotebookViewer
 
 
 def ignore(event: Event) -> None:
@@ -75,15 +80,87 @@ def run_scene(
         >>> run = run_scene("captures/garden", "runs/garden", config, on_event=print)  # doctest: +SKIP
         >>> run.plans[0].count  # doctest: +SKIP
     """
+    with _working(RunDir(Path(folder), config.ladder), on_event, device, backend, threads, force) as job:
+        pipeline.run_all(job, Path(scene), config)
+    return open_run(folder, config.ladder)
+
+
+@contextmanager
+def _working(
+    run: RunDir, on_event: Emit, device: str, backend: Backend, threads: int, force: bool
+) -> Iterator[Job]:
+    """A job that works on a run folder, which nobody else writes into between two stages."""
     if (device, backend) == ("auto", "auto") and cuda.missing() is None:
         device = "cuda"
     backend, threads = resolve_backend(backend, device), set_threads(threads)
-    run = RunDir(Path(folder), config.ladder)
     check_links(run.path)
-    with ExitStack() as locks:  # nobody else writes into the folder between two stages
-        job = Job(run, on_event, backend, threads, force, device=device, locks=locks)
-        pipeline.run_all(job, Path(scene), config)
-    return open_run(folder, config.ladder)
+    with ExitStack() as locks:
+        yield Job(run, on_event, backend, threads, force, device=device, locks=locks)
+
+
+def adopt_splat(
+    splat: Path | str | Gaussians,
+    folder: Path | str,
+    adopt: AdoptConfig = AdoptConfig(),
+    config: RunConfig = RunConfig(),  # noqa: B008 - frozen
+    *,
+    cameras: Path | str | Sequence[Camera] | None = None,
+    names: Mapping[int, str] | None = None,
+    antialiased: bool = False,
+    on_event: Emit = ignore,
+    device: str = "auto",
+    backend: Backend = "auto",
+    threads: int = 0,
+    force: bool = False,
+) -> "FinishedRun":
+    """Make a run of a trained splat: levels, promises, plans and a report, as `sagesplat adopt SPLAT RUN`.
+
+    Stages whose results are in `folder` already, made with the same settings, are skipped. A killed run is
+    resumed by the same call.
+
+    Args:
+        splat: A file of any format that `read_splat` reads, or Gaussians; these are kept in the run folder.
+        folder: The run folder; made if it is not there.
+        adopt: How the levels are made, and viewpoints drawn. `AdoptConfig(fit="none")` is the fast way.
+        config: Settings of scene, masks, labels, sample, fit and plan; training and nesting are not used.
+        cameras: Where to look from: a capture, with or without photos, a cameras.json of 3DGS, a
+            transforms.json or a viewpoints.json, or cameras, all in the frame of the splat. None:
+            `adopt.cameras`, by default viewpoints drawn from the splat.
+        names: Of Gaussians: category names by label id. A file has its own.
+        antialiased: Of Gaussians: whether they were trained so.
+        on_event: Called with each event (`StageDone`, `Progress`, ...). Nothing is printed otherwise.
+        device: "auto" (a CUDA GPU where there is one that works), "cpu" or "cuda".
+        backend: Rasteriser: "auto", "cpu", "cuda" or "reference".
+        threads: CPU threads; 0: one per core. Set for the whole process.
+        force: Replace results that were made with other settings or from another splat; those that match are
+            kept.
+
+    Returns:
+        The finished run.
+
+    Raises:
+        SageError: For anything wrong with the splat, the cameras, the settings, the run folder or the
+            machine.
+
+    Example:
+        >>> from sagesplat import AdoptConfig, Gaussians, adopt_splat
+        >>> g = Gaussians.from_gsplat(splats)  # doctest: +SKIP
+        >>> run = adopt_splat(g, "runs/garden", AdoptConfig(fit="none"))  # doctest: +SKIP
+        >>> run.show()  # doctest: +SKIP
+    """
+    run = RunDir(Path(folder))
+    with _working(run, on_event, device, backend, threads, force) as job:
+        if isinstance(splat, Gaussians):
+            source = write_given_splat(run, splat, names or {}, antialiased)
+        elif names or antialiased:
+            raise RunError(f"{splat}: a file says names and antialiasing itself; leave out what was given")
+        else:
+            source = Path(splat)
+        if cameras is not None:
+            by_path = isinstance(cameras, Path | str)
+            adopt = replace(adopt, cameras=Path(cameras) if by_path else write_given_cameras(run, cameras))
+        pipeline.adopt(job, source, adopt, config)
+    return open_run(folder)
 
 
 def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun":
@@ -157,9 +234,24 @@ def apply_labels(
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """The results of a run folder. Made by `open_run` and `run_scene`."""
+    """The results of a run folder, from `open_run`, `run_scene` or `adopt_splat`; `print` lists its plans."""
 
     job: Job
+
+    def __repr__(self) -> str:
+        return f"FinishedRun({str(self.path)!r})"
+
+    def __str__(self) -> str:
+        head = f"{self.path}: {self.job.run.ladder} levels"
+        if not self.job.run.plan.exists():
+            return f"{head}, not planned yet"
+        rows = [(plan.asked, *plan.sizes, plan.verdict) for plan in self.plans]
+        return f"{head}\n{aligned(('plan', 'MB', 'Gaussians', 'status'), rows, right=(1, 2))}"
+
+    @property
+    def path(self) -> Path:
+        """The run folder."""
+        return self.job.run.path
 
     @property
     def scene(self) -> Scene:
@@ -189,7 +281,7 @@ class FinishedRun:
     @cached_property
     def plans(self) -> tuple[Plan, ...]:
         """The scene's plans, those of the quality that leads first. RunError before `sagesplat plan`."""
-        return plans_of(self.job)
+        return tuple(replace(plan, titles=self.titles) for plan in plans_of(self.job))
 
     @cached_property
     def _method(self) -> Method:
@@ -241,7 +333,23 @@ class FinishedRun:
             raise RunError("a camera is planned for one target; give target_fidelity or target_ssim")
         config = PlanConfig(target_fidelity, target_ssim)
         config = check_targets(config, self.job.run.ladder)
-        return self._method.plan_camera(camera, config.target, config.quality)
+        return replace(self._method.plan_camera(camera, config.target, config.quality), titles=self.titles)
+
+    def show(self, *, height: int = 480) -> NotebookViewer:
+        """The viewer in the cell of a notebook (Jupyter, VS Code): the last expression of the cell shows it.
+
+        The whole scene is inside the cell's output, and so in the notebook where that is saved.
+
+        Args:
+            height: Of the viewer, px. It is as wide as the cell.
+
+        Raises:
+            RunError: For a run without nested levels, or a scene that is too large for one page.
+        """
+        with TemporaryDirectory() as work:
+            page = Path(work) / "scene.html"
+            self.bundle(page, single_file=True)
+            return NotebookViewer(page.read_text(encoding="utf-8"), height, str(self.path))
 
     def bundle(self, out: Path | str, *, single_file: bool = False) -> BundleMade:
         """Write the run for browsers: levels, promises and the viewer, as static files.
@@ -265,7 +373,7 @@ class FinishedRun:
             plan: A plan, or levels by label id.
 
         Returns:
-            All categories merged, on the CPU. `write_ply` and `write_spz` save them.
+            All categories merged, on the CPU. `write_splat` saves them.
 
         Raises:
             RunError: For a level that the ladder does not have.

@@ -93,7 +93,7 @@ def report_data(
         plans=list(plans_of(job)),
         evaluation=evaluation_of(job),
         panels=picture_panels(job, composed),
-        scene_facts=describe(scene),
+        scene_facts=[(title, _placeless(text)) for title, text in describe(scene)],
         settings=_settings(records),
         timings=[(stage, float(made.get("seconds", math.nan))) for stage, made in records.items()],
         provenance=_provenance(records),
@@ -130,9 +130,10 @@ def _adopted(job: Job, ladder: NestedLadder) -> list[tuple[str, str]]:
     names = titles(job.names())
     first = {names[ladder.label_of[cell]]: max(of) for cell, of in ladder.cells.replaces.items() if of}
     originals = ", ".join(f"{titled} {level}" for titled, level in first.items())
+    drawn = f"{made['views']} drawn from the splat, kind {made['kind']}"
     return [
         ("file", Path(made["source"]).name),
-        ("viewpoints", made["cameras"] or f"{made['views']} drawn from the splat, kind {made['kind']}"),
+        ("viewpoints", f"those of {Path(made['cameras']).name}" if made["cameras"] else drawn),
         ("compared with", "photos" if made["photos"] else "renders of the splat as it came in"),
         ("labels", "those of the file, if it has any" if made["labelled"] else "votes of label images"),
         ("lower levels", trained if nest["fit"] == "renders" else "merged Gaussians, not trained"),
@@ -154,15 +155,20 @@ def stage_records(run: RunDir) -> list[Path]:
 
 
 def _commands(job: Job) -> Commands:
-    """What is typed to go on with a run."""
+    """What is typed to go on with a run, in the folder that holds it: that stays right where it is moved."""
     run = job.run
-    where = shlex.quote(str(run.path.resolve()))
+    where = run.path.resolve()
+    name = shlex.quote(where.name)
     if run.adopted.exists():
-        return Commands(where)
+        return Commands(name)
     posed = run.provenance("poses").exists()
-    capture = settings_of(run, "poses")["source"] if posed else str(read_capture(run.scene).path)
+    capture = Path(settings_of(run, "poses")["source"] if posed else read_capture(run.scene).path)
     steps = settings_of(run, "train").get("max_steps", 0) if run.provenance("train").exists() else 0
-    return Commands(where, shlex.quote(capture), int(steps))
+    try:
+        near = os.path.relpath(capture, where.parent)
+    except ValueError:  # on another drive
+        near = capture.name
+    return Commands(name, shlex.quote(near), int(steps))
 
 
 def links(run: RunDir) -> list[tuple[str, str]]:
@@ -287,10 +293,15 @@ def _settings(records: dict[str, dict]) -> list[tuple[str, str]]:
     rows = []
     for stage, made in records.items():
         for name, value in made["settings"].items():
-            text = value if isinstance(value, str) else json.dumps(value)
+            text = _placeless(value) if isinstance(value, str) else json.dumps(value)
             if len(text) != 64:  # a hash
                 rows.append((f"{stage}.{name}", text))
     return rows
+
+
+def _placeless(text: str) -> str:
+    """The name of a path outside of the run, which moving the run does not make wrong; of others the text."""
+    return Path(text).name if os.path.isabs(text) or text.startswith("../") else text
 
 
 def _provenance(records: dict[str, dict]) -> list[tuple[str, str]]:
@@ -305,5 +316,5 @@ def _provenance(records: dict[str, dict]) -> list[tuple[str, str]]:
         ("torch", torch.__version__),
         ("numba", numba.__version__),
     ]
-    hashes = {name: h for made in records.values() for name, h in made["inputs"].items()}
+    hashes = {_placeless(name): h for made in records.values() for name, h in made["inputs"].items()}
     return versions + [(f"sha256 of {name}", h) for name, h in sorted(hashes.items())]

@@ -39,7 +39,7 @@ _SHARES = {1: "all", 2: "half", 4: "a quarter", 8: "an eighth"}  # of a photo's 
 
 def check_folder(run: RunDir) -> None:
     """RunError for a folder that holds something else than a run."""
-    ours = (run.scene, run.capture, run.adopted, run.provenance("scene"))
+    ours = (run.scene, run.capture, run.adopted, run.from_python, run.provenance("scene"))
     if not run.path.exists() or any(path.exists() for path in ours):
         return
     if any(not p.name.startswith(".") for p in run.path.iterdir()):

@@ -11,12 +11,14 @@ import torch
 from msgspec import Meta
 
 from sagesplat.core.errors import DataError, RunError
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import NO_OFFSET, Position
 from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import repaired
 from sagesplat.formats.increments import INDEX, Increment, Refine, read_increments, read_index, shown
 from sagesplat.formats.lod_meta import LOD_META, level_files
 from sagesplat.formats.sog import META
+from sagesplat.formats.splat import cleaned
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.io.typed import convert_as, read_json_as, refused
 from sagesplat.run.capture import read_capture
@@ -66,6 +68,12 @@ def levels_of(path: Path) -> list[Level]:
     ]  # fmt: skip
 
 
+def level_of(g: Gaussians, number: int) -> Level:
+    """Gaussians of a script as a level: its bytes are those of a PLY, 248 each."""
+    name = f"level {number}" if number else "reference"
+    return Level(name, "Gaussians", g.nbytes, lambda: cleaned(Splat(g.detach().to("cpu"), "Gaussians"), name))
+
+
 def stored_bytes(path: Path) -> int:
     """Size of a splat file; of an unpacked SOG that of its folder's description and pictures."""
     file = path / META if path.is_dir() else path
@@ -76,12 +84,12 @@ def stored_bytes(path: Path) -> int:
         raise DataError(f"{file}: cannot be read ({error.strerror}); copy it again") from None
 
 
-def unique_names(levels: Sequence[Level], paths: Sequence[Path]) -> list[str]:
-    """Their names; of those that several have, with the folder, or else a number."""
+def unique_names(levels: Sequence[Level], folders: Sequence[str]) -> list[str]:
+    """Their names; of those that several have, with their folder, or else a number."""
     times = Counter(level.name for level in levels)
     names = [
-        level.name if times[level.name] == 1 else f"{repaired(path.resolve().parent.name)}/{level.name}"
-        for level, path in zip(levels, paths, strict=True)
+        level.name if times[level.name] == 1 or not folder else f"{repaired(folder)}/{level.name}"
+        for level, folder in zip(levels, folders, strict=True)
     ]
     times, seen = Counter(names), Counter[str]()
     for i, name in enumerate(names):

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from sagesplat.adapt.observe import TOTAL
+from sagesplat.core.text_table import aligned
 from sagesplat.io.files import write_json
 from sagesplat.metrics.flip import PIXELS_PER_DEGREE
 from sagesplat.output.figures import ACCENT, FAINT, STYLE, save_figure, shortened
@@ -41,6 +42,13 @@ class Measured:
     categories: Mapping[int, str]
     others: Sequence[str]  # columns of MS-SSIM, FLIP and LPIPS, as far as they were measured
     rows: Sequence[Row]
+
+    def __repr__(self) -> str:
+        return f"<measured: {', '.join(self.names)} at {len(self.views)} viewpoints>"
+
+    def __str__(self) -> str:
+        table = levels_table(self).only("level", "Gaussians", "MB", "SSIM", "PSNR", "worst SSIM")
+        return f"{table.title}\n{aligned(table.header, table.cells(), right=(1, 2, 3, 4, 5))}"
 
     def of(self, level: int, label_id: int) -> list[Row]:
         """The rows of a level and a region."""

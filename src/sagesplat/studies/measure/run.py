@@ -11,6 +11,7 @@ from sagesplat.adapt.free_viewpoints import check_size, free_cameras
 from sagesplat.core.config import MeasureConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageStarted, Warned
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import Position
 from sagesplat.formats.splat import relative_to
 from sagesplat.formats.splats import Splat
@@ -18,11 +19,11 @@ from sagesplat.io.typed import check_limits
 from sagesplat.metrics import flip
 from sagesplat.metrics.image import ssim_map
 from sagesplat.output.contact_sheet import contact_sheet
-from sagesplat.raster import Backend
+from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
 from sagesplat.scene.cameras import read_camera_file
 from sagesplat.scene.scene import Camera
 from sagesplat.studies.lpips import load_metrics
-from sagesplat.studies.measure.levels import Level, levels_of, unique_names
+from sagesplat.studies.measure.levels import Level, level_of, levels_of, unique_names
 from sagesplat.studies.measure.report import (
     SIDE,
     Measured,
@@ -35,18 +36,56 @@ from sagesplat.studies.measure.report import (
 from sagesplat.studies.measure.score import FLIP, MS_SSIM, Renderer, compare
 
 
-def measure(
-    paths: Sequence[Path], out: Path, config: MeasureConfig, emit: Emit, backend: Backend = "cpu"
+def measure_levels(
+    reference: Path | str | Gaussians,
+    levels: Path | str | Gaussians | Sequence[Path | str | Gaussians] = (),
+    out: Path | str = Path("measure"),
+    config: MeasureConfig = MeasureConfig(),
+    *,
+    on_event: Emit = lambda event: None,
+    device: str = "auto",
+    backend: Backend = "auto",
+    threads: int = 0,
 ) -> Measured:
-    """Measure levels against their scene; write tables, curves and viewpoints to the folder `out`.
+    """Measure levels of detail against their scene, whoever made them: what `sagesplat measure` does.
 
-    `paths`, as `levels.levels_of` takes them: of one, its finest level is the reference of its others; of
-    several, all levels of all but the first are measured against the finest of the first. RunError for one
-    level alone, and where no viewpoint has anything in sight.
+    Args:
+        reference: The full scene: a splat of any format or Gaussians; or, without `levels`, a lod-meta.json,
+            a bundle or a run folder, whose finest level is then the reference of its others.
+        levels: What is measured against it; of a path with several levels all of them.
+        out: Folder for tables (levels.csv, views.csv, measure.json), curves and a contact sheet of the
+            viewpoints; made if it is not there.
+        config: Viewpoints and metrics.
+        on_event: Called with each event (`Progress`, `TableMade`, `Warned`). Nothing is printed otherwise.
+        device: "auto" (a CUDA GPU where there is one that works), "cpu" or "cuda".
+        backend: Rasteriser: "auto", "cpu", "cuda" or "reference".
+        threads: CPU threads; 0: one per core. Set for the whole process.
+
+    Returns:
+        SSIM, PSNR and other metrics of every level at every viewpoint; `print` shows their means.
+
+    Raises:
+        RunError: For one level alone, and where no viewpoint has anything in sight.
+        DataError: For what is no splat, and has no levels.
+
+    Example:
+        >>> from sagesplat import measure_levels
+        >>> print(measure_levels("runs/garden"))  # doctest: +SKIP
     """
+    if (device, backend) == ("auto", "auto") and cuda.missing() is None:
+        device = "cuda"
+    backend, _ = resolve_backend(backend, device), set_threads(threads)
+    some = levels if isinstance(levels, Sequence) and not isinstance(levels, str) else [levels]
+    return _measure([reference, *some], Path(out), config, on_event, backend)
+
+
+def _measure(
+    given: Sequence[Path | str | Gaussians], out: Path, config: MeasureConfig, emit: Emit, backend: Backend
+) -> Measured:
+    """See `measure_levels`."""
     emit(StageStarted("measure"))
     check_limits(config)
-    reference, levels, names = _levels(paths)
+    reference, levels, names = _levels(given)
     truth = reference.load()
     for note in truth.notes:
         emit(Warned(f"{reference.name}: {note}"))
@@ -89,17 +128,23 @@ def measure(
     return measured
 
 
-def _levels(paths: Sequence[Path]) -> tuple[Level, list[Level], list[str]]:
+def _levels(given: Sequence[Path | str | Gaussians]) -> tuple[Level, list[Level], list[str]]:
     """The reference, the levels, and their names, each another."""
-    first, *others = [levels_of(path) for path in paths]
+    sources = [one if isinstance(one, Gaussians) else Path(one) for one in given]
+    first, *others = [
+        [level_of(one, number)] if isinstance(one, Gaussians) else levels_of(one)
+        for number, one in enumerate(sources)
+    ]
     levels = [level for some in others for level in some] if others else first[1:]
     if not levels:
         raise RunError(
-            f"{paths[0]}: one level, and nothing to compare it with; name its levels after it, or give a "
-            "lod-meta.json, a bundle or a run"
+            f"{first[0].name}: one level, and nothing to compare it with; name its levels after it, or give "
+            "a lod-meta.json, a bundle or a run"
         )
-    owners = [path for path, some in zip(paths[1:], others, strict=True) for _ in some]
-    return first[0], levels, unique_names(levels, owners or [paths[0]] * len(levels))
+    owners = [one for one, some in zip(sources[1:], others, strict=True) for _ in some]
+    owners = owners or [sources[0]] * len(levels)
+    folders = ["" if isinstance(one, Gaussians) else one.resolve().parent.name for one in owners]
+    return first[0], levels, unique_names(levels, folders)
 
 
 def _viewpoints(
