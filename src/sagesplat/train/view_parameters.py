@@ -70,13 +70,11 @@ class ViewUpdate(Protocol):
     @property
     def first_step(self) -> int:
         """The step from which on gradients of the parameters are taken."""
-        ...
 
     def __call__(
         self, parameters: ViewParameters, views: Sequence[int], grad: Float32[Tensor, "R D"], step: int
     ) -> None:
         """Update the parameters of the views of a step from their gradients; also fixes the gauge."""
-        ...
 
 
 class ViewGradients:
