@@ -25,7 +25,7 @@ from sagesplat.scene import load_scene
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.train.events import Step, Trained
-from sagesplat.train.optim import adam_step
+from sagesplat.train.optim import adam_steps
 from sagesplat.train.state import from_points
 from sagesplat.train.trainer import train
 
@@ -222,9 +222,10 @@ def parts(g: Gaussians, camera: Camera, photo: torch.Tensor, degree: int, repeat
     def adam() -> None:
         for name, leaf in leaves.items():
             assert leaf.grad is not None
-            adam_step(
-                leaf.detach().numpy(), leaf.grad.numpy(), first[name].numpy(), second[name].numpy(),
-                lr=1e-9, step=100, trainable=np.ones(len(g), bool), columns=in_use if name == "shN" else None,
+            tensors = leaf.detach(), leaf.grad, first[name], second[name]
+            adam_steps(
+                *([tensor.numpy()] for tensor in tensors), rates=[1e-9], step=100,
+                trainable=np.ones(len(g), bool), columns=[in_use if name == "shN" else None],
             )  # fmt: skip
 
     def step() -> None:

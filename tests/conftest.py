@@ -27,6 +27,7 @@ from sagesplat.core.events import Event
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.sh import num_bases, sh0_to_rgb
 from sagesplat.demo.capture import make_capture as make_demo_capture
+from sagesplat.io.columns import text_cell
 from sagesplat.io.files import write_json, write_text
 from sagesplat.io.lock import locked
 from sagesplat.raster import Backend, Render, rasterize, set_threads
@@ -354,6 +355,11 @@ def demo_run(tmp_path_factory: pytest.TempPathFactory) -> DemoRun:
     run = tmp_path_factory.mktemp("demo") / "run"
     shutil.copytree(made / "run", run)  # each process may lock its own
     return DemoRun(made / "capture", run, DEMO_RUN, pickle.loads((made / "events").read_bytes()))
+
+
+def cell_text(cell: str) -> str:
+    """The text that `text_cell` made a cell of."""
+    return cell[1:] if text_cell(cell[1:]) == cell else cell
 
 
 def wait_for(condition: Callable[[], object], seconds: float = 600.0) -> None:

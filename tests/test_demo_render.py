@@ -33,7 +33,7 @@ def test_depth_of_the_paving_is_that_of_the_plane(camera, view):
 
 
 def test_box_tree_finds_what_trying_every_leaf_finds(camera):
-    world = lit_world(0)
+    world = lit_world(0, (1, 1))
     origins, directions, _ = rays_of(camera)
     rng = np.random.default_rng(5)
     frame = world.leaves

@@ -1,5 +1,6 @@
 """Downloads of single scenes, from a server on this machine, out of archives with the published layout."""
 
+import errno
 import io
 import re
 import stat
@@ -16,10 +17,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sagesplat.core.errors import DataError
+from sagesplat.core.errors import DataError, RunError
 from sagesplat.download import remote_zip
 from sagesplat.download.remote_zip import RemoteZip
-from sagesplat.download.scenes import RemoteScene, download_scene, find_scene
+from sagesplat.download.scenes import RemoteScene, download_scene, find_scene, read_registry
 
 NAME = "mipnerf360/garden"
 
@@ -372,6 +373,36 @@ def test_a_bomb_writes_no_more_than_it_lists(site, monkeypatch):
     assert next(blocks) == bytes(1001)
     with pytest.raises(DataError, match="1001 bytes"):
         next(blocks)
+
+
+def test_a_full_disk(site, tmp_path, monkeypatch):
+    opened = Path.open
+
+    class Full(io.BytesIO):
+        def write(self, content):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    def full(path: Path, mode: str = "r", *args, **kwargs):
+        space = mode != "wb" or "DSC00009" not in path.name
+        return opened(path, mode, *args, **kwargs) if space else Full()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", full)
+        with pytest.raises(RunError) as caught:
+            fetch(site, tmp_path)
+    assert_one_line(caught.value, "DSC00009.JPG", "the disk is full", "nothing was lost")
+    fetch(site, tmp_path)
+    assert contents(tmp_path) == expected()
+
+
+def test_the_registry():
+    scenes = list(read_registry().values())
+    assert [scene.name for scene in scenes] == list(read_registry())
+    for scene in scenes:
+        assert scene.url.startswith("https://")
+        assert scene.scale in scene.scales
+        assert 10**9 <= scene.limit <= 12 * 10**9
+        assert "https://" in scene.licence
 
 
 def test_a_kill_between_members(site, tmp_path):

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_gaussians, write_capture
+from conftest import cell_text, random_gaussians, write_capture
 from PIL import Image
 
 from sagesplat import cli
-from sagesplat.io.columns import cell_text
 from sagesplat.io.files import read_json, write_json
 
 NAMES = {

@@ -10,6 +10,7 @@ import browser as chromium
 import numpy as np
 import pytest
 from browser import launch, open_page
+from conftest import cell_text
 from page_checks import wrong_with, wrong_with_keyboard
 from PIL import Image
 
@@ -19,7 +20,6 @@ from sagesplat.adapt.evaluate import QUALITIES, UNIFORM, Evaluation, read_evalua
 from sagesplat.adapt.observe import TOTAL, Observations, read_observations
 from sagesplat.adapt.plan import Choice, Plan, Reached
 from sagesplat.adapt.viewpoint import QualityKind
-from sagesplat.io.columns import cell_text
 from sagesplat.output import figures, report_figures
 from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands, next_steps

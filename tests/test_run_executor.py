@@ -36,7 +36,7 @@ from sagesplat.stages.observe import observe_levels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.sample import sample_levels
 from sagesplat.stages.scene import open_scene
-from sagesplat.studies.compare import run as compare_study
+from sagesplat.studies.compare import report as comparison
 from sagesplat.studies.compare.run import compare
 from sagesplat.studies.sweep.file import read_sweep
 from sagesplat.studies.sweep.run import run_sweep
@@ -91,7 +91,7 @@ def add(job: Job, number: int) -> int:
 def plain_comparison() -> Iterator[None]:
     """Figures take most of the time of so small a run, and have their own tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compare_study, "write_report", lambda folder, *_: write_text(folder / "compare.md", ""))
+        patch.setattr(comparison, "write_report", lambda folder, *_: write_text(folder / "compare.md", ""))
         yield
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from colmap_text import write_text_model
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -51,7 +52,8 @@ def capture(
         photo = folder / "images" / name
         photo.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(rng.integers(0, 256, (camera.height, camera.width, 3)).astype(np.uint8)).save(photo)
-    write_model(folder / sparse, cameras, images, xyz, rgb, np.full(20, 0.25), text=text)
+    write = write_text_model if text else write_model
+    write(folder / sparse, cameras, images, xyz, rgb, np.full(20, 0.25))
     return xyz
 
 

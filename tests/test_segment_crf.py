@@ -7,7 +7,8 @@ from scipy.special import softmax
 
 from sagesplat.demo.capture import demo_cameras
 from sagesplat.demo.render import render_view
-from sagesplat.segment.crf import CrfConfig, Lattice, bilateral_features, refine
+from sagesplat.segment import crf
+from sagesplat.segment.crf import Lattice, bilateral_features, refine
 
 
 def exact(features: np.ndarray) -> np.ndarray:
@@ -18,15 +19,15 @@ def exact(features: np.ndarray) -> np.ndarray:
     return scale[:, None] * kernel * scale
 
 
-def oracle(p: np.ndarray, photo: np.ndarray, config: CrfConfig) -> np.ndarray:
+def oracle(p: np.ndarray, photo: np.ndarray) -> np.ndarray:
     """Mean-field inference with whole matrices in float64."""
     v, u = np.indices(photo.shape[:2])
-    place = np.stack([u, v], 2).reshape(-1, 2) / config.spatial_xy_std
-    alike = config.bilateral_weight * exact(bilateral_features(photo, config))
-    both = alike + config.spatial_weight * exact(place)
+    place = np.stack([u, v], 2).reshape(-1, 2) / crf.SPATIAL_XY_STD
+    alike = crf.BILATERAL_WEIGHT * exact(bilateral_features(photo))
+    both = alike + crf.SPATIAL_WEIGHT * exact(place)
     log_p = np.log(np.maximum(p.reshape(len(p), -1).astype(float), 1e-5))
     q = softmax(log_p, axis=0)
-    for _ in range(config.iterations):
+    for _ in range(crf.ITERATIONS):
         q = softmax(log_p + q @ both, axis=0)
     return q.reshape(p.shape)
 
@@ -51,7 +52,7 @@ def smooth_probabilities(classes: int, height: int, width: int, seed: int = 0) -
 @pytest.mark.parametrize("kind", ["garden", "noise", "edges"])
 def test_agrees_with_whole_matrices(kind: str) -> None:
     p, photo = smooth_probabilities(4, 30, 37), photo_of(kind, 30, 37)
-    expected = oracle(p, photo, CrfConfig())
+    expected = oracle(p, photo)
     assert (expected.argmax(0) != p.argmax(0)).mean() > 0.01  # there is something to agree on
     q = refine(p, photo)
     assert q.shape == p.shape
@@ -61,12 +62,12 @@ def test_agrees_with_whole_matrices(kind: str) -> None:
     assert (q.argmax(0) == expected.argmax(0)).mean() > 0.985
 
 
-@pytest.mark.parametrize(
-    "config", [CrfConfig(bilateral_weight=0), CrfConfig(bilateral_weight=0, spatial_xy_std=2.5)]
-)
-def test_the_filter_of_place_is_exact(config: CrfConfig) -> None:
+@pytest.mark.parametrize("std", [1.0, 2.5])
+def test_the_filter_of_place_is_exact(std: float, monkeypatch) -> None:
+    monkeypatch.setattr(crf, "BILATERAL_WEIGHT", 0.0)
+    monkeypatch.setattr(crf, "SPATIAL_XY_STD", std)
     p, photo = smooth_probabilities(3, 12, 17), photo_of("noise", 12, 17)
-    np.testing.assert_allclose(refine(p, photo, config), oracle(p, photo, config), atol=2e-3)
+    np.testing.assert_allclose(refine(p, photo), oracle(p, photo), atol=2e-3)
 
 
 @pytest.mark.parametrize("dimensions", [1, 2, 3, 5])

@@ -8,6 +8,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from sagesplat.core.errors import LabelError
+from sagesplat.segment import deeplabv2
 from sagesplat.segment.deeplabv2 import (
     COCO_STUFF_UNUSED,
     HEADS,
@@ -236,35 +237,39 @@ def test_coco_stuff() -> None:
 # the segmenter
 
 
-def test_input_is_bgr_less_the_mean_at_the_tested_size() -> None:
+def test_input_is_bgr_less_the_mean_at_the_tested_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(deeplabv2, "SIZE", 64)
     model = Fixed([0.0] * 21)
     photo = np.full((40, 80, 3), (10, 20, 30), np.uint8)
-    DeepLabV2Segmenter(model, head_classes("voc"), size=64)([photo])
+    DeepLabV2Segmenter(model, head_classes("voc"))([photo])
     assert [tuple(x.shape) for x in model.seen] == [(1, 3, 32, 64), (1, 3, 24, 48), (1, 3, 16, 32)]
     expected = torch.tensor([30, 20, 10]) - torch.tensor(MEAN_BGR)
     torch.testing.assert_close(model.seen[0][0, :, 5, 5], expected)
 
 
 @pytest.mark.parametrize("crf", [False, True])
-def test_outputs_of_one_category_are_summed(crf: bool) -> None:
+def test_outputs_of_one_category_are_summed(crf: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(deeplabv2, "SIZE", 12)
     ids = (17, 18, 17, None)
     model = Fixed([1.0, 1.5, 1.0, 0.0, 9.0])  # the last one was never trained
-    segmenter = DeepLabV2Segmenter(model, HeadClasses((0, 1, 2, 3), ids), size=None, crf=crf)
+    segmenter = DeepLabV2Segmenter(model, HeadClasses((0, 1, 2, 3), ids), crf=crf)
     (found,) = segmenter([np.full((9, 12, 3), 90, np.uint8)])
     assert (found.label_ids == 17).all()
     assert found.label_ids.dtype == np.int16
 
 
-def test_background_is_unlabelled() -> None:
-    segmenter = DeepLabV2Segmenter(Fixed([9.0] + [0.0] * 20), head_classes("voc"), size=None)
+def test_background_is_unlabelled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(deeplabv2, "SIZE", 8)
+    segmenter = DeepLabV2Segmenter(Fixed([9.0] + [0.0] * 20), head_classes("voc"))
     (found,) = segmenter([np.zeros((8, 8, 3), np.uint8)])
     assert (found.label_ids == -1).all()
 
 
 @pytest.mark.parametrize("crf", [False, True])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (23, 37)])
-def test_photos_of_any_size(shape: tuple[int, int], crf: bool) -> None:
-    segmenter: Segmenter = DeepLabV2Segmenter(small(), head_classes("voc"), size=33, crf=crf)
+def test_photos_of_any_size(shape: tuple[int, int], crf: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(deeplabv2, "SIZE", 33)
+    segmenter: Segmenter = DeepLabV2Segmenter(small(), head_classes("voc"), crf=crf)
     grey = np.repeat(np.random.default_rng(0).integers(0, 256, (*shape, 1), np.uint8), 3, axis=2)
     first, second = segmenter([grey, np.zeros((5, 4, 3), np.uint8)])
     assert first.label_ids.shape == shape

@@ -13,7 +13,6 @@ from sagesplat.core.errors import LabelError
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment import edit
 from sagesplat.segment.edit import (
-    apply,
     count_pixels,
     edit_labels,
     edit_table,
@@ -76,10 +75,10 @@ def test_merge_and_keep_as_a_table() -> None:
     taxonomy, table = edit_table(TAXONOMY, keep=("tree-merged",), merge={"vase": "potted plant"})
     assert taxonomy.names == {TREE: "tree-merged"}
     label_ids = np.array([[CAR, PLANT, VASE, TREE, -1]], np.int16)
-    assert apply(label_ids, table).tolist() == [[-1, -1, -1, TREE, -1]]
+    assert table[label_ids].tolist() == [[-1, -1, -1, TREE, -1]]
     taxonomy, table = edit_table(TAXONOMY, merge={"vase": "potted plant", "potted plant": "tree-merged"})
     assert taxonomy.names == {CAR: "car", TREE: "tree-merged"}
-    new = apply(label_ids, table)
+    new = table[label_ids]
     assert new.tolist() == [[CAR, TREE, TREE, TREE, -1]]
     assert new.dtype == np.int16
 
@@ -176,8 +175,8 @@ def test_a_killed_edit_in_place_is_finished_by_the_next(tmp_path: Path, monkeypa
 def test_an_edit_done_twice_is_an_edit_done_once(pixels: list[int]) -> None:
     label_ids = np.array(pixels, np.int16)
     _, table = edit_table(TAXONOMY, merge={"vase": "potted plant"}, keep=["potted plant", "car"])
-    once = apply(label_ids, table)
-    assert (apply(once, table) == once).all()
+    once = table[label_ids]
+    assert (table[once] == once).all()
     assert ((once == -1) == np.isin(label_ids, [-1, TREE])).all()
 
 

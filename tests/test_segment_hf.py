@@ -13,7 +13,7 @@ from PIL import Image
 
 from sagesplat.core.errors import BackendUnavailable, LabelError, OutOfMemory
 from sagesplat.segment import coco, panoptic
-from sagesplat.segment.hf import HfSegmenter, class_ids
+from sagesplat.segment.hf import HfSegmenter, _Answer, class_ids
 from sagesplat.segment.hub import prepared, torch_device
 from sagesplat.segment.segmenters import Segmenter
 
@@ -193,10 +193,9 @@ def test_crops_are_put_back_where_they_were(folders: dict[str, Path]) -> None:
 def test_scores_are_summed_and_at_most_1(folders: dict[str, Path]) -> None:
     """Two queries of one class count together; what is left to 1 is no object."""
     segmenter = HfSegmenter(folders["eomt"], device="cpu")
-    inputs = {"pixel_values": torch.zeros(1, 3, 8, 8)}
     half = torch.logit(torch.full((3, 2, 2), 0.5))
     weights = torch.tensor([[0.6, 0, 0, 0], [0.4, 0, 0.2, 0], [0, 0.1, 0, 0]])
-    scores = segmenter._scores(weights, half, inputs)
+    scores = segmenter._scores(_Answer(weights[None], half[None], (8, 8), (8, 8), []), 0)
     np.testing.assert_allclose(scores[:, 0, 0], [0.5, 0.05, 0.1, 0], atol=1e-6)
     assert (segmenter._ids[scores.argmax(0)] == min(IDS)).all()
 

@@ -13,16 +13,17 @@ from PIL import Image
 from sagesplat.core.errors import BackendUnavailable, SceneError
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import Camera, Scene, View
-from sagesplat.segment.masks import Taxonomy
-from sagesplat.segment.segmenters import (
-    Segmented,
-    arg_max_resized,
-    group_classes,
-    parse_device,
-    segment_views,
-)
+from sagesplat.segment.masks import Taxonomy, write_labels
+from sagesplat.segment.segmenters import Segmented, arg_max_resized, group_classes, parse_device, segment_some
 
 SKY, TREE = 187, 184
+
+
+def segment_views(scene: Scene, photos, segmenter, target: Path, **options) -> None:
+    """Write the label images of all views, then labels.json."""
+    rows = range(len(scene.views))
+    occurring = segment_some(scene, photos, segmenter, target, rows, **options)
+    write_labels(target, segmenter.taxonomy, occurring)
 
 
 class Bright:

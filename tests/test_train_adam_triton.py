@@ -5,10 +5,9 @@ import os
 import numpy as np
 import pytest
 import torch
+from test_train_optim import adam_step as on_cpu
 from test_train_optim import gradients
 from torch import Tensor
-
-from sagesplat.train import optim
 
 GPU = torch.cuda.is_available()
 DEVICE = "cuda" if GPU else "cpu"
@@ -48,7 +47,7 @@ def test_steps_are_adams_and_the_cpus(shape):
     for step, grad in enumerate(grads, start=1):
         (g,) = on_device([grad])
         adam_step(actual[0], g, *actual[1:], lr=3e-3, step=step, trainable=None)
-        optim.adam_step(of_cpu[0], grad, *of_cpu[1:], lr=3e-3, step=step, trainable=everything)
+        on_cpu(of_cpu[0], grad, *of_cpu[1:], lr=3e-3, step=step, trainable=everything)
     expected = plain_adam(torch.from_numpy(arrays[0]).double(), grads, 3e-3)
     largest = torch.from_numpy(np.abs(grads).max(0) + 1e-30)
     parameter, exp_avg, exp_avg_sq = (a.cpu().double() for a in actual)
@@ -83,7 +82,7 @@ def test_frozen_rows_and_columns_keep_every_bit_and_the_others_do_not_notice(col
 def test_a_leaf_moves_in_place_by_a_gradient_in_other_memory():
     (value, exp_avg, exp_avg_sq), (grad,) = on_device(start((20, 3))), gradients((20, 3), 1)
     expected = [a.cpu().numpy().copy() for a in (value, exp_avg, exp_avg_sq)]
-    optim.adam_step(expected[0], grad, *expected[1:], lr=0.1, step=1, trainable=np.ones(20, bool))
+    on_cpu(expected[0], grad, *expected[1:], lr=0.1, step=1, trainable=np.ones(20, bool))
     leaf = value.requires_grad_()
     turned = torch.from_numpy(np.ascontiguousarray(grad.T)).to(DEVICE).T
     adam_step(leaf, turned, exp_avg, exp_avg_sq, lr=0.1, step=1, trainable=None)

@@ -1,12 +1,19 @@
 """The fused Adam against torch's, and rows that are left alone."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from conftest import random_gaussians
 
-from sagesplat.train.optim import adam_step, update
+from sagesplat.train.optim import adam_steps, update
 from sagesplat.train.state import initial_state
+
+
+def adam_step(*arrays: np.ndarray, lr: float, columns: int | None = None, **how: Any) -> None:
+    """One Adam step of one parameter: it, its gradient and both moments."""
+    adam_steps(*([array] for array in arrays), rates=[lr], columns=[columns], **how)
 
 
 def gradients(shape: tuple[int, ...], steps: int) -> list[np.ndarray]:

@@ -5,10 +5,15 @@ import pytest
 import torch
 from conftest import random_gaussians
 
-from sagesplat.formats.quantisation import in_buckets
-from sagesplat.train.rate import add_gradient, estimated_bits
+from sagesplat.formats.quantisation import in_buckets, sh_steps
+from sagesplat.train.rate import add_gradient
 
 BITS = (5, 4)
+
+
+def estimated_bits(shN: torch.Tensor, sh_bits: tuple[int, int]) -> torch.Tensor:
+    """Bits of the harmonics of each Gaussian [N], about."""
+    return torch.log2(1 + shN.abs() / sh_steps(shN, sh_bits)).flatten(1).sum(1)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -121,7 +121,7 @@ def test_opacities_on_the_shell_are_not_reset(capture):
     config = TrainConfig(max_steps=30_000, sh_degree=0, lr_schedule="published")
     strategy = make_strategy(config, scene, lr_schedule(config, 1.0, []), shell=found.shell)
     state = initial_state(from_points(scene.points, ids, 0, opacity=0.9), 0)
-    state.step = next(step for step in range(1, 9999) if strategy.resets(step))
+    state.step = next(step for step in range(1, 9999) if strategy.schedule.resets(step))
     strategy.step_post(state)
     faint = state.gaussians.logit_opacities.sigmoid() < 0.5
     assert torch.equal(faint, ~found.shell.holds(state.gaussians.means))

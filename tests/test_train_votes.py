@@ -7,7 +7,7 @@ from conftest import orbit, pinhole, random_gaussians
 
 from sagesplat.raster import Workspace, add_weights, rasterize
 from sagesplat.scene.scene import Points, Scene, View
-from sagesplat.train.votes import label_weights, vote
+from sagesplat.train.votes import label_weights, winners
 
 
 class _Masks:
@@ -64,7 +64,7 @@ def test_views_add_up_and_the_heavier_label_wins():
         columns = np.select([masks[view] == 2, masks[view] == 7], [0, 1], -1)
         expected += _expected(g, view.camera, columns, 2)
     np.testing.assert_allclose(weights, expected, atol=1e-4)
-    labels = vote(g, scene, masks, [0, 2])  # type: ignore[arg-type]
+    labels = winners(g, ids, weights)
     seen = expected.sum(1) > 1e-3
     assert (labels.numpy()[seen] == ids[expected.argmax(1)[seen]]).all()
 
@@ -72,5 +72,5 @@ def test_views_add_up_and_the_heavier_label_wins():
 def test_what_no_view_shows_keeps_its_label():
     g, scene, masks = _scene()
     g.means[:10, 2] = -50.0  # behind all cameras
-    labels = vote(g, scene, masks, range(3))  # type: ignore[arg-type]
+    labels = winners(g, *label_weights(g, scene, masks, range(3)))  # type: ignore[arg-type]
     assert torch.equal(labels[:10], g.label_ids[:10])

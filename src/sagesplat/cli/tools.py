@@ -103,11 +103,11 @@ def download(
     """
     from sagesplat.cli.console import Console
     from sagesplat.core.events import Progress, StageStarted
-    from sagesplat.download.scenes import download_scene, find_scene, list_scenes
+    from sagesplat.download.scenes import download_scene, find_scene, read_registry
     from sagesplat.download.weights import download_lpips
 
     if show:
-        for scene in list_scenes():
+        for scene in read_registry().values():
             size = f"of a {scene.archive_gb:g} GB archive" if scene.archive_gb else ""
             print(f"{scene.name:24} {scene.photos:4} photos {size:24} {scene.page}")
         return

@@ -27,15 +27,7 @@ from sagesplat.demo.render import (
     take_photo,
     threads_map,
 )
-from sagesplat.demo.wild import (
-    FACING,
-    NOTHING,
-    Wild,
-    camera_gains,
-    kept_views,
-    lens_falloff,
-    noisy_cameras,
-)
+from sagesplat.demo.wild import FACING, NOTHING, Wild, camera_gains, kept_views, lens_falloff, noisy_cameras
 from sagesplat.demo.world import BRICK, CORE, LABELS, LEAF, ROOF, WOOD
 from sagesplat.io.files import cache_folder, unwritable, write_json
 from sagesplat.scene.scene import Camera
@@ -237,7 +229,7 @@ def _write_objects(
 
 def _render_objects(camera: Camera, seed: int) -> Int16[np.ndarray, "H W"]:
     """The object of `build_world` at each pixel's centre, NO_OBJECT where there is none."""
-    world = lit_world(seed)
+    world = lit_world(seed, (1, 1))
     v, u = (np.indices((camera.height, camera.width)) + 0.5).reshape(2, -1)
     origins, directions, _ = camera_rays(camera, np.stack([u, v], 1))
     _, material, part = cast_rays(world, origins, directions, FAR, float(1 / camera.K[0, 0]))

@@ -5,19 +5,7 @@ from jaxtyping import Float64
 
 from sagesplat.demo.noise import fbm
 from sagesplat.demo.textures import TEXTURES, Hits, leaf_colours
-from sagesplat.demo.world import (
-    BRICK,
-    CORE,
-    GLAZE,
-    GRASS,
-    LEAF,
-    PAVING,
-    ROOF,
-    SKY,
-    SUN,
-    World,
-    radius_at,
-)
+from sagesplat.demo.world import BRICK, CORE, GLAZE, GRASS, LEAF, PAVING, ROOF, SKY, SUN, World, radius_at
 
 DOME = 80.0  # radius of the sphere on which the sky is painted
 SUN_RGB, SKY_RGB, BOUNCE_RGB = np.array([[2.9, 2.7, 2.3], [0.62, 0.70, 0.88], [0.06, 0.06, 0.05]])

@@ -23,13 +23,9 @@ FIGURE = LEAF + 1  # material of `figures.Figures`
 NEEDS_RAY = 3  # materials from this one on, except leaves, cast a shadow ray
 
 
-def lit_world(seed: int, places: tuple[int, int] = (1, 1)) -> World:
-    """The garden of a seed with baked light; `places`: number of courtyards along x and y."""
-    return _lit_world(seed, places)
-
-
 @lru_cache(maxsize=1)
-def _lit_world(seed: int, places: tuple[int, int]) -> World:
+def lit_world(seed: int, places: tuple[int, int]) -> World:
+    """The garden of a seed with baked light; `places`: number of courtyards along x and y."""
     world = build_world(seed) if places == (1, 1) else build_places(seed, places)
     axis = np.linspace(-world.plot, world.plot, len(world.ground_light))
     ground = np.stack([*np.meshgrid(axis, axis), np.zeros((len(axis), len(axis)))], -1)

@@ -64,14 +64,9 @@ def read_registry() -> dict[str, RemoteScene]:
     return scenes
 
 
-def list_scenes(registry: Registry | None = None) -> list[RemoteScene]:
-    """All scenes of the registry, in its order."""
-    return list((read_registry() if registry is None else registry).values())
-
-
 def find_scene(name: str, registry: Registry | None = None) -> RemoteScene:
-    """The scene with this name. DataError if there is none."""
-    scenes = {scene.name: scene for scene in list_scenes(registry)}
+    """The scene with this name, of the registry or of another one. DataError if there is none."""
+    scenes = read_registry() if registry is None else registry
     if name not in scenes:
         raise DataError(f"{name}: no such scene; take one of {', '.join(scenes)}")
     return scenes[name]

@@ -6,6 +6,7 @@ import http.client
 import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -70,7 +71,8 @@ def download_lpips(
     """
     paths = [weights_path(net, folder) for net in nets]
     for net, path in zip(nets, paths, strict=True):
-        if _usable(net, path):
+        with suppress(BackendUnavailable, DataError):
+            load_lpips(net, path)
             continue
         try:
             with atomic_path(path) as temporary:
@@ -81,14 +83,6 @@ def download_lpips(
             reason = error.strerror or error
             raise RunError(f"{path}: cannot be written ({reason}); name another folder") from error
     return paths
-
-
-def _usable(net: Net, path: Path) -> bool:
-    try:
-        load_lpips(net, path)
-    except (BackendUnavailable, DataError):
-        return False
-    return True
 
 
 def _fetch_weights(

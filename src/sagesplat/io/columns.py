@@ -50,11 +50,6 @@ def text_cell(text: str) -> str:
     return f"'{text}" if _FORMULA.match(text) else text
 
 
-def cell_text(cell: str) -> str:
-    """The text that `text_cell` made a cell of."""
-    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
-
-
 def _types(table: type) -> dict[str, np.dtype]:
     return {f.name: np.dtype(f.type.dtypes[0]) for f in fields(table)}  # type: ignore
 

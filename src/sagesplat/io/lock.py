@@ -118,9 +118,12 @@ def _open(folder: Path) -> int:
 
 def _describe(handle: int) -> None:
     """Write into a lock's file who holds it."""
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    now = datetime.now().astimezone().isoformat(" ", "seconds")
+    ourselves = {"pid": os.getpid(), "host": socket.gethostname(), "command": command, "since": now}
     with suppress(OSError):  # e.g. a full disk: the lock holds without the description
         os.ftruncate(handle, 0)
-        os.write(handle, json.dumps(_ourselves()).encode())
+        os.write(handle, json.dumps(ourselves).encode())
 
 
 def _take(handle: int) -> None:
@@ -145,12 +148,6 @@ class _Holder:
     host: str
     command: str
     since: str
-
-
-def _ourselves() -> dict[str, str | int]:
-    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    now = datetime.now().astimezone().isoformat(" ", "seconds")
-    return {"pid": os.getpid(), "host": socket.gethostname(), "command": command, "since": now}
 
 
 def _holder(path: Path) -> str:

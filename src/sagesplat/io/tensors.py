@@ -4,9 +4,8 @@ import mmap
 from typing import IO, Any
 from zipfile import ZIP_STORED, ZipFile, is_zipfile
 
-_REFUSED = (
-    "WeightsUnpickler error: "  # torch says before how to read the file nevertheless, and run what is in it
-)
+# before it torch says how to read the file nevertheless, and run what is in it
+_REFUSED = "WeightsUnpickler error: "
 
 
 def read_tensors(file: IO[bytes]) -> Any:

@@ -150,26 +150,20 @@ for _symbol, _name in ((operator.ge, ">="), (operator.gt, ">"), (operator.le, "<
     _define(_symbol, lambda builder, a, b, name=_name: builder.fcmp_ordered(name, a, b), compares=True)
 
 
-@infer_global(operator.neg)
-class _Negation(AbstractTemplate):
-    def generic(self, args: Any, kws: Any) -> Any:
-        return signature(args[0], *args) if isinstance(args[0], Vector) else None
+def _define_alike(symbol: Callable[..., Any], *kinds: type, emit: Callable[..., Any]) -> None:
+    """An operator whose operands are all of one type, which is the result's."""
+
+    @infer_global(symbol)
+    class _Operator(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            fits = len(args) == len(kinds) and isinstance(args[0], kinds) and len(set(args)) == 1
+            return signature(args[0], *args) if fits else None
+
+    lower_builtin(symbol, *kinds)(lambda context, builder, sig, values: emit(builder, *values))
 
 
-@lower_builtin(operator.neg, Vector)
-def _negate(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-    return builder.fneg(values[0])
-
-
-@infer_global(operator.and_)
-class _And(AbstractTemplate):
-    def generic(self, args: Any, kws: Any) -> Any:
-        return signature(args[0], *args) if isinstance(args[0], Mask) and args[0] == args[1] else None
-
-
-@lower_builtin(operator.and_, Mask, Mask)
-def _and(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-    return builder.and_(*values)
+_define_alike(operator.neg, Vector, emit=lambda builder, a: builder.fneg(a))
+_define_alike(operator.and_, Mask, Mask, emit=lambda builder, a, b: builder.and_(a, b))
 
 
 # Functions -----------------------------------------------------------------------------------------------

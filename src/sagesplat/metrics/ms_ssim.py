@@ -1,7 +1,7 @@
 """Multi-scale SSIM (Wang, Simoncelli and Bovik 2003), of the SSIM of 3DGS at each scale."""
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 from scipy.ndimage import correlate1d
 
 from sagesplat.metrics import ssim_cpu
@@ -12,11 +12,7 @@ WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _C1 = 0.01**2
 
 
-def ms_ssim(
-    x: Float32[np.ndarray, "H W 3"],
-    y: Float32[np.ndarray, "H W 3"],
-    valid: Bool[np.ndarray, "H W"] | None = None,
-) -> float:
+def ms_ssim(x: Float32[np.ndarray, "H W 3"], y: Float32[np.ndarray, "H W 3"]) -> float:
     """MS-SSIM of two images in [0, 1], the mean over the channels; 1 = the same image.
 
         MS-SSIM = l_M^w_M  product over the scales j = 1 ... M of cs_j^w_j
@@ -30,8 +26,6 @@ def ms_ssim(
     Args:
         x: Image in [0, 1].
         y: Image in [0, 1].
-        valid: The pixels that count; None: all. Of coarser ones the share that does. NaN where a scale has
-            none.
 
     Example:
         >>> import numpy as np
@@ -40,20 +34,17 @@ def ms_ssim(
         >>> round(ms_ssim(photo, photo), 5), ms_ssim(photo, 1 - photo) < 0.1
         (1.0, True)
     """
-    counts = np.ones(x.shape[:2], np.float32) if valid is None else valid.astype(np.float32)
     weights = np.array(WEIGHTS[: num_scales(*x.shape[:2])])
     product = np.full(3, 1.0 if len(weights) else np.nan)
     for scale, weight in enumerate(weights / weights.sum()):
         if scale:
-            x, y, counts = halved(x), halved(y), halved(counts)
+            x, y = halved(x), halved(y)
         quality = ssim_planes(x, y)
         if scale < len(weights) - 1:
             quality = quality / _luminance(x, y)
-        rows, columns = (slice(ssim_cpu.RADIUS, length - ssim_cpu.RADIUS) for length in counts.shape)
-        shares = counts[rows, columns]
-        total = float(shares.sum(dtype=np.float64))
-        sums = (quality[:, rows, columns] * shares).sum((1, 2), dtype=np.float64)
-        product *= np.maximum(sums / total, 0) ** weight if total else np.nan
+        inside = quality[:, ssim_cpu.RADIUS : -ssim_cpu.RADIUS, ssim_cpu.RADIUS : -ssim_cpu.RADIUS]
+        sums = inside.sum((1, 2), dtype=np.float64)
+        product *= np.maximum(sums / inside[0].size, 0) ** weight
     return float(product.mean())
 
 

@@ -63,12 +63,8 @@ def _four_blurs(patches, at):
     mx, my, squares, product = a * _K5, b * _K5, (a * a + b * b) * _K5, a * b * _K5
     for distance, k in ((1, _K4), (2, _K3), (3, _K2), (4, _K1), (5, _K0)):
         up, down = at - distance * _LINE, at + distance * _LINE
-        a, b, c, d = (
-            load(patches, up),
-            load(patches, _PATCH + up),
-            load(patches, down),
-            load(patches, _PATCH + down),
-        )
+        a, b = load(patches, up), load(patches, _PATCH + up)
+        c, d = load(patches, down), load(patches, _PATCH + down)
         mx, my = mx + (a + c) * k, my + (b + d) * k
         squares, product = squares + (a * a + b * b + c * c + d * d) * k, product + (a * b + c * d) * k
     return mx, my, squares, product

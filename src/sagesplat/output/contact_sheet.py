@@ -19,6 +19,7 @@ from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.io.files import atomic_path
 from sagesplat.io.pictures import open_picture
 from sagesplat.output.figures import ACCENT, FAINT, INK, STYLE, shortened
+from sagesplat.output.place_figures import outline
 from sagesplat.raster import Backend, Workspace
 from sagesplat.scene.scene import Camera
 
@@ -28,7 +29,6 @@ _WIDTH = 14.0  # inches
 _MAPS = 4.2  # inches, height of the maps
 _SIDE = 200  # px, longer side of a picture
 _DOTS = 20_000  # Gaussians on a map
-_AROUND = 0.8  # what is farther from the cameras than so many times their spread is not aimed at
 _MARGIN = 0.08  # of a map around what it shows
 _ARROW = 0.25  # inches, length of a viewing direction
 _MAP_WIDTH, _MAP_HEIGHT = 0.46, 0.84  # of a map, as shares of the sheet's width and of _MAPS
@@ -127,9 +127,7 @@ def _map(
     at: Float[np.ndarray, "V 2"],
     towards: Float[np.ndarray, "V 2"],
 ) -> None:
-    reach = _AROUND * float(np.ptp(at, axis=0).max()) or np.inf
-    near = dots[((dots > at.min(0) - reach) & (dots < at.max(0) + reach)).all(1)]  # or a far sky decides
-    shown = np.concatenate([at, *([np.quantile(near, [0.02, 0.98], axis=0)] if len(near) else [])])
+    shown = outline(at, dots)
     low, high = shown.min(0), shown.max(0)
     shape = np.array([_MAP_WIDTH * _WIDTH, _MAP_HEIGHT * _MAPS])  # inches
     least = 1e-6 * float(np.abs(shown).max()) + 1e-30  # of one point

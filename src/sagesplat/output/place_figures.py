@@ -93,12 +93,16 @@ def _camera(ring: str, size: float, label: str) -> Line2D:
     return Line2D([], [], marker="o", ls="", ms=size, mfc="#9bb7d4", mec=ring, mew=1.4, label=label)
 
 
+def outline(at: Float[np.ndarray, "V 2"], points: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "N 2"]:
+    """What a map has to show: all cameras, and the corners of the points around them without the farthest."""
+    reach = _AROUND * float(np.ptp(at, axis=0).max()) or np.inf  # else a far sky decides
+    near = points[((points > at.min(0) - reach) & (points < at.max(0) + reach)).all(1)]
+    return np.concatenate([at, *([np.quantile(near, [0.02, 0.98], axis=0)] if len(near) else [])])
+
+
 def _window(place: Place) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """The corners of the map: all cameras, and the points around them without the farthest."""
-    at = place.at.astype(np.float64)
-    reach = _AROUND * float(np.ptp(at, axis=0).max()) or np.inf
-    near = place.points[((place.points > at.min(0) - reach) & (place.points < at.max(0) + reach)).all(1)]
-    shown = np.concatenate([at, *([np.quantile(near, [0.02, 0.98], axis=0)] if len(near) else [])])
+    """The corners of the map."""
+    shown = outline(place.at.astype(np.float64), place.points)
     low, high = shown.min(0), shown.max(0)
     least = max(float((high - low).max()), 1e-6 * float(np.abs(shown).max()) + 1e-30)
     half = np.maximum(high - low, 0.3 * least) * (0.5 + _MARGIN)

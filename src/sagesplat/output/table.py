@@ -51,7 +51,7 @@ class Table:
     def write_csv(self, path: Path) -> None:
         """A header, then one line per row; NaN is an empty cell, marks are a last column.
 
-        Text that a spreadsheet would take for a formula begins with a ' (`io.columns.cell_text` removes it).
+        Text that a spreadsheet would take for a formula begins with a ' (`io.columns.text_cell`).
         """
         notes = [""] * len(self.rows)
         for (row, column), mark in sorted(self.marks.items()):

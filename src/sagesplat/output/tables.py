@@ -25,7 +25,6 @@ class Kept:
 
     promised: int
     kept: int
-    overshoot: float  # mean of measured SSIM minus target where promised; NaN if nothing was
 
     @property
     def share(self) -> float:
@@ -195,36 +194,27 @@ def targets_table(
     return Table("Size by target", tuple(header), formats, [*body, tuple(total)])
 
 
-class Decisions(Protocol):
-    """Rows of (label, view, target) with what was predicted of the chosen level and what was measured."""
+class _Decisions(Protocol):
+    """Columns of rows of (label, view, target): what was predicted of the chosen level, and measured."""
 
     @property
-    def target(self) -> np.ndarray:
-        """Target SSIM, [R]."""
-        ...
+    def target(self) -> np.ndarray: ...  # SSIM, [R]
 
     @property
-    def label_id(self) -> np.ndarray:
-        """Category, [R]."""
-        ...
+    def label_id(self) -> np.ndarray: ...  # [R]
 
     @property
-    def predicted(self) -> np.ndarray:
-        """SSIM predicted of the chosen level, [R]."""
-        ...
+    def predicted(self) -> np.ndarray: ...  # SSIM, [R]
 
     @property
-    def ssim(self) -> np.ndarray:
-        """SSIM measured, [R]."""
-        ...
+    def ssim(self) -> np.ndarray: ...  # measured, [R]
 
 
-def promise_kept(rows: Decisions) -> Kept:
+def promise_kept(rows: _Decisions) -> Kept:
     """Of the (label, view, target) rows whose predicted SSIM reaches the target, those measured there too."""
     measured = np.isfinite(rows.ssim) & (rows.label_id != TOTAL)
     promised = measured & (rows.predicted >= rows.target)
-    excess = (rows.ssim - rows.target)[promised]
-    return Kept(int(promised.sum()), int((excess >= 0).sum()), mean(excess))
+    return Kept(int(promised.sum()), int((promised & (rows.ssim >= rows.target)).sum()))
 
 
 def evaluation_table(evaluation: Evaluation, labels: Sequence[int], names: Mapping[int, str]) -> Table:

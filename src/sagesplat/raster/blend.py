@@ -153,15 +153,16 @@ def row_alpha(raw, left):
     return where((raw >= _ALPHA_MIN) & (left >= _T_MIN), minimum(raw, _ALPHA_MAX), _ZERO)
 
 
+@njit(forceinline=True, cache=True)
+def _colour(batch, j):
+    return spread(batch, 6 * BATCH + j), spread(batch, 7 * BATCH + j), spread(batch, 8 * BATCH + j)
+
+
 @njit(error_model="numpy", forceinline=True, cache=True)
 def _blend(s, batch, rows, j, x0, y0):
     """Blend one Gaussian into a tile; planes of s: T, r, g, b."""
     share_rows(s, batch, j, y0)
-    red, green, blue = (
-        spread(batch, 6 * BATCH + j),
-        spread(batch, 7 * BATCH + j),
-        spread(batch, 8 * BATCH + j),
-    )
+    red, green, blue = _colour(batch, j)
     stretch = int(batch[RECORD, j])
     for band in range(BANDS):
         lo, hi = int(rows[band, 0, j]), int(rows[band, 1, j])
@@ -218,11 +219,7 @@ def forward(records, starts, ids, row_order, width, height, background, image, l
 def _pass(s, batch, rows, j, x0, y0):
     """What `_gradient` does to the planes, for a Gaussian whose own gradient nobody asks for."""
     share_rows(s, batch, j, y0)
-    red, green, blue = (
-        spread(batch, 6 * BATCH + j),
-        spread(batch, 7 * BATCH + j),
-        spread(batch, 8 * BATCH + j),
-    )
+    red, green, blue = _colour(batch, j)
     stretch = int(batch[RECORD, j])
     for band in range(BANDS):
         lo, hi = int(rows[band, 0, j]), int(rows[band, 1, j])
@@ -249,11 +246,7 @@ def _gradient(s, batch, rows, j, x0, y0, sums, slot):
     Planes of s: T, what is still to come of (gradient . colour), dL/d(r, g, b), dL/dalpha.
     """
     share_rows(s, batch, j, y0)
-    red, green, blue = (
-        spread(batch, 6 * BATCH + j),
-        spread(batch, 7 * BATCH + j),
-        spread(batch, 8 * BATCH + j),
-    )
+    red, green, blue = _colour(batch, j)
     stretch = int(batch[RECORD, j])
     s0 = s1 = s2 = t0 = tx = ty = txx = txy = tyy = splat(_ZERO)
     for band in range(BANDS):

@@ -103,8 +103,8 @@ class _Rasterize(torch.autograd.Function):
         left = take("left", height, padded(width))
         ends = np.empty(len(found.starts) - 1, np.int64)
         passes = [(records, _array(background))] + [
-            (_with_colors(records, chunk), np.zeros(_CHUNK, np.float32))
-            for chunk in _chunks(_array(features))
+            (_with_channels(records, _array(features), at), np.zeros(_CHUNK, np.float32))
+            for at in range(0, features.shape[1], _CHUNK)
         ]
         images = []
         for index, (painted, behind) in enumerate(passes):
@@ -138,7 +138,9 @@ class _Rasterize(torch.autograd.Function):
         g_left, no_left = _gradient_of_left(g_alpha, left, space), left[:0]
         for index, (records, image) in enumerate(zip(painted, images, strict=True)):
             first = index == 0
-            g_image = g_rgb if first else _chunk(g_extra, index - 1)
+            g_image, at = g_rgb if first else g_extra, _CHUNK * (index - 1)
+            if not first and g_image is not None:
+                g_image = g_image[..., at : at + _CHUNK]
             blend.backward(
                 records, moved if masked else radii[:0], found.starts, ends, found.ids, found.slots,
                 found.row_order, camera.width, image, left, _planes(g_image, left, space),
@@ -148,7 +150,7 @@ class _Rasterize(torch.autograd.Function):
             found_of = records, moved, found.offsets, reached, rows
             sums.reduce(*found_of, g_mean2d, g_conic, g_opacity, g_channels)
             if not first:
-                part = g_features[:, _CHUNK * (index - 1) : _CHUNK * index]
+                part = g_features[:, at : at + _CHUNK]
                 part[:] = g_channels[:, : part.shape[1]]
         if (
             not to_pose
@@ -215,23 +217,11 @@ def _of_pose(camera: Camera, d_means: np.ndarray, d_turns: np.ndarray) -> Tensor
     return torch.from_numpy(pose.astype(np.float32))
 
 
-def _chunks(features: np.ndarray) -> list[np.ndarray]:
-    return [_padded(features, at) for at in range(0, features.shape[-1], _CHUNK)]
-
-
-def _chunk(values: Tensor | None, index: int) -> Tensor | None:
-    return None if values is None else values[..., _CHUNK * index : _CHUNK * (index + 1)]
-
-
-def _padded(values: np.ndarray, at: int) -> np.ndarray:
-    """Channels at..at+3 of the last axis, with zeros where there are no more."""
-    part = values[..., at : at + _CHUNK]
-    return np.ascontiguousarray(np.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, _CHUNK - part.shape[-1])]))
-
-
-def _with_colors(records: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    painted = records.copy()
-    painted[:, 6:9] = colors
+def _with_channels(records: np.ndarray, features: np.ndarray, at: int) -> np.ndarray:
+    """Records whose colours are the features at..at+3, with zeros where there are no more."""
+    painted, part = records.copy(), features[:, at : at + _CHUNK]
+    painted[:, 6:9] = 0
+    painted[:, 6 : 6 + part.shape[1]] = part
     return painted
 
 

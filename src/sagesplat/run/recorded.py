@@ -4,21 +4,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from sagesplat.core.config import (
-    AdoptConfig,
-    BlocksConfig,
-    CleanConfig,
-    FitConfig,
-    LabelsConfig,
-    LadderKind,
-    MasksConfig,
-    NestConfig,
-    PlanConfig,
-    PosesConfig,
-    SampleConfig,
-    SceneConfig,
-    TrainConfig,
-)
+from sagesplat.core import config
 from sagesplat.core.limits import NotNegative, Seed
 from sagesplat.io.typed import convert_as, known_json
 from sagesplat.run.records import FORMAT
@@ -27,10 +13,10 @@ from sagesplat.run.run_dir import RunDir
 Config = TypeVar("Config")
 
 
-def recorded_ladder(path: Path) -> LadderKind:
+def recorded_ladder(path: Path) -> config.LadderKind:
     """The kind of levels that a run has results of: nested ones, unless there are only others."""
-    kinds: tuple[LadderKind, ...] = get_args(LadderKind)
-    made: list[LadderKind] = [kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()]
+    kinds: tuple[config.LadderKind, ...] = get_args(config.LadderKind)
+    made = [kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()]
     return made[0] if len(made) == 1 else "nested"
 
 
@@ -50,18 +36,18 @@ def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
         label_images = {}  # made by adopt
     seeded = _config(_Seeded, nest if of == "nest" and nest else train)
     known: dict[str, Any] = {
-        "adopt": _config(AdoptConfig, {**adopted, **_levels_of_adopted(nest)}) if adopted else None,
-        "scene_config": _config(SceneConfig, scene.settings) if scene else None,
-        "poses": _config(PosesConfig, _made(run, "poses")),
-        "masks": _config(MasksConfig, label_images),
-        "labels": _config(LabelsConfig, _labels(run)),
-        "train": _config(TrainConfig, train),
-        "clean": _config(CleanConfig, _made(run, "clean")),
-        "blocks": _config(BlocksConfig, _made(run, "blocks")),
-        "nest": _config(NestConfig, nest),
-        "sample": _config(SampleConfig, _made(run, "sample")),
-        "fit": _config(FitConfig, observed),
-        "plan": _config(PlanConfig, _made(run, "plan")),
+        "adopt": _config(config.AdoptConfig, {**adopted, **_levels_of_adopted(nest)}) if adopted else None,
+        "scene_config": _config(config.SceneConfig, scene.settings) if scene else None,
+        "poses": _config(config.PosesConfig, _made(run, "poses")),
+        "masks": _config(config.MasksConfig, label_images),
+        "labels": _config(config.LabelsConfig, _labels(run)),
+        "train": _config(config.TrainConfig, train),
+        "clean": _config(config.CleanConfig, _made(run, "clean")),
+        "blocks": _config(config.BlocksConfig, _made(run, "blocks")),
+        "nest": _config(config.NestConfig, nest),
+        "sample": _config(config.SampleConfig, _made(run, "sample")),
+        "fit": _config(config.FitConfig, observed),
+        "plan": _config(config.PlanConfig, _made(run, "plan")),
         "seed": seeded.seed if seeded else None,
         "fuse": True if run.provenance("fuse").exists() else None,
     }

@@ -14,8 +14,8 @@ from sagesplat.core.names import cleaned, clipped, collision_key
 from sagesplat.io.colour_profile import profile_of
 from sagesplat.io.files import atomic_path, link
 from sagesplat.io.pictures import PictureError, open_picture
-from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.exif import DETAILS, exif_of
+from sagesplat.scene.find_photos import PHOTOS
 from sagesplat.scene.given_masks import holds_masks, is_mask_among, mask_folders_below
 from sagesplat.scene.images import as_rgb
 
@@ -76,7 +76,11 @@ def prepare_photos(
 def _list(source: Path, skipped: Path) -> list[Path]:
     """Photos below a folder, without hidden ones and masks, sorted by name with numbers by value."""
     skipped = skipped.resolve()
-    masks = [folder for folder in mask_folders_below(source) if _holds_no_photos(folder)]
+    masks = [
+        folder
+        for folder in mask_folders_below(source)
+        if (folder / "labels.json").exists() or holds_masks(folder)
+    ]
     outside = not source.resolve().is_relative_to(skipped)
     photos = []
     for path in source.rglob("*"):
@@ -91,11 +95,6 @@ def _list(source: Path, skipped: Path) -> list[Path]:
         names.setdefault(path.parent, set()).add(path.name.lower())
     photos = [path for path in photos if not is_mask_among(path, frozenset(names[path.parent]))]
     return sorted(photos, key=_by_number)
-
-
-def _holds_no_photos(folder: Path) -> bool:
-    """Whether a folder of a name for masks holds masks, or label images."""
-    return (folder / "labels.json").exists() or holds_masks(folder)
 
 
 def _by_number(path: Path) -> list[tuple[int, str]]:

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +38,6 @@ def sequential_pairs(count: int) -> list[tuple[int, int]]:
     pairs = {(i, i + step) for step in steps for i in range(count - step)}
     keys = np.unique(np.linspace(0, count - 1, min(KEYFRAMES, count)).astype(int)).tolist()
     return sorted(pairs | {(a, b) for a in keys for b in keys if a < b})
-
-
-def all_pairs(count: int) -> list[tuple[int, int]]:
-    """All pairs of photos (exhaustive matching)."""
-    return [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
 def upright(rotations: np.ndarray) -> np.ndarray:
@@ -113,8 +109,9 @@ class Stages:
 
     def matches(self, on_progress: OnProgress) -> None:
         """Match and verify the pairs that have not been matched yet."""
+        count = len(self.order)
         sequential = self.request["matching"] == "sequential"
-        wanted = (sequential_pairs if sequential else all_pairs)(len(self.order))
+        wanted = sequential_pairs(count) if sequential else [*combinations(range(count), 2)]
         with pycolmap.Database.open(self.database) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             left = [

@@ -9,20 +9,11 @@ import numpy as np
 from sagesplat.core.errors import SceneError, short
 from sagesplat.core.geometry import Position, less_offset, offset_of
 from sagesplat.core.names import check_photo, repaired
+from sagesplat.scene import loading
 from sagesplat.scene.colmap_read import ModelPoints, read_model
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage
 from sagesplat.scene.find_model import FoundModel, find_model
 from sagesplat.scene.find_photos import PHOTO_FOLDERS, plain
-from sagesplat.scene.loading import (
-    MIN_VIEWS,
-    Fisheye,
-    at_downscale,
-    check_found,
-    check_settings,
-    describe_lenses,
-    describe_photos,
-    views_of,
-)
 from sagesplat.scene.points import random_points, read_points, seen_or_random
 from sagesplat.scene.raw_photos import photos_before
 from sagesplat.scene.scene import Lens, Points, Scene, View
@@ -37,7 +28,7 @@ def load_colmap(
     downscale: int = 1,
     test_every: int = 8,
     images: Path | None = None,
-    fisheye: Fisheye = "crop",
+    fisheye: loading.Fisheye = "crop",
 ) -> Scene:
     """The scene of a COLMAP workspace: a model, usually in `sparse/0`, and its photos, usually in `images/`.
 
@@ -47,18 +38,18 @@ def load_colmap(
     by the faces of a cube, and their observations are undistorted. Observations outside the image are
     dropped. Without points, there are random ones. Raises SceneError.
     """
-    check_settings(path, downscale, test_every)
+    loading.check_settings(path, downscale, test_every)
     with np.errstate(all="ignore"):  # damaged numbers overflow; the results are checked to be finite
         chosen, notes = find_model(path, images)
         cameras, listed, points = read_model(chosen.folder)
         _check_names(chosen.folder, listed)
         listed = _there(chosen, listed)
-        notes += describe_photos(chosen.photos, photos_before(path))
-        files, divisor = at_downscale(chosen.photos, downscale)
+        notes += loading.describe_photos(chosen.photos, photos_before(path))
+        files, divisor = loading.at_downscale(chosen.photos, downscale)
         listed = sorted(listed, key=lambda image: chosen.photos.files[image.name])
         offset, listed, points = _near_origin(listed, points)
         views, rows = _views(chosen, files, cameras, listed, divisor, fisheye)
-        notes += describe_lenses(views)
+        notes += loading.describe_lenses(views)
         tracked = _scene_points(chosen.folder, cameras, [listed[row] for row in rows], views, points)
         if tracked is None:
             tracked, more = _points_beside(path, chosen.folder, views, offset)
@@ -95,11 +86,12 @@ def _there(chosen: FoundModel, listed: Sequence[ModelImage]) -> list[ModelImage]
     """The images of a model whose photos are there. SceneError for too few of them."""
     if len(set(chosen.photos.names)) < len(listed):
         raise SceneError(f"{chosen.folder}: the model lists a photo twice; run COLMAP's mapper again")
-    if len(listed) < MIN_VIEWS:
+    if len(listed) < loading.MIN_VIEWS:
+        least = loading.MIN_VIEWS
         raise SceneError(
-            f"{chosen.folder}: {len(listed)} posed photos, but it takes {MIN_VIEWS}; add photos, run COLMAP"
+            f"{chosen.folder}: {len(listed)} posed photos, but it takes {least}; add photos, run COLMAP"
         )
-    check_found(chosen.photos, "the model")
+    loading.check_found(chosen.photos, "the model")
     return [image for image in listed if image.name in chosen.photos.files]
 
 
@@ -130,7 +122,7 @@ def _check_names(model: Path, listed: Sequence[ModelImage]) -> None:
 
 def _views(
     chosen: FoundModel, files: dict[str, Path], cameras: dict[int, ModelCamera], listed: Sequence[ModelImage],
-    divisor: int, fisheye: Fisheye,
+    divisor: int, fisheye: loading.Fisheye,
 ) -> tuple[tuple[View, ...], list[int]]:  # fmt: skip
     """The views, and of each the row of its image: there are several of an image that is shown as a cube."""
     views: list[View] = []
@@ -145,7 +137,7 @@ def _views(
         lens = Lens(c.model, c.params, c.width, c.height)
         name = chosen.photos.files[image.name]
         try:
-            views += views_of(name, files[image.name], image.w2c, lens, divisor, fisheye)
+            views += loading.views_of(name, files[image.name], image.w2c, lens, divisor, fisheye)
         except ValueError as error:
             raise SceneError(
                 f"{chosen.folder}: camera {c.id}: {error}; calibrate it again with COLMAP"

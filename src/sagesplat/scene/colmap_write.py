@@ -1,4 +1,4 @@
-"""Writes COLMAP models, text and binary, for the demo capture and the tests.
+"""Writes COLMAP models in binary: of the demo capture, and of the viewpoints of adopted splats.
 
 Format: https://colmap.github.io/format.html, without rigs and frames, which COLMAP before 3.12
 cannot read.
@@ -47,16 +47,31 @@ def write_model(
     xyz: Float[np.ndarray, "P 3"],
     rgb: UInt8[np.ndarray, "P 3"],
     error: Float[np.ndarray, " P"],
-    *,
-    text: bool = False,
 ) -> None:
-    """Write cameras, images and points3D (.bin, or .txt with `text`) into `folder`, usually sparse/0.
+    """Write cameras.bin, images.bin and points3D.bin into `folder`, usually sparse/0.
 
     `error` is each point's mean reprojection error in pixels. Row r of `xyz` gets the point id r + 1;
     the tracks of points3D are those of the images' `point_rows`.
     """
-    write = _write_text if text else _write_binary
-    write(folder, cameras, images, np.asarray(xyz, float), rgb, error, _tracks(images, len(xyz)))
+    xyz = np.asarray(xyz, float)
+    with atomic_path(folder / "cameras.bin") as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(cameras)))
+        for c in cameras:
+            file.write(struct.pack("<IiQQ", c.id, CAMERA_MODELS[c.model].id, c.width, c.height))
+            file.write(np.array(c.params, "<f8").tobytes())
+    with atomic_path(folder / "images.bin") as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(images)))
+        for i in images:
+            file.write(struct.pack("<I7dI", i.id, *_pose(i), i.camera_id) + i.name.encode() + b"\0")
+            observed = np.empty(len(i.uv), [("uv", "<f8", 2), ("point", "<i8")])
+            observed["uv"] = i.uv
+            observed["point"] = np.where(i.point_rows >= 0, i.point_rows + 1, -1)
+            file.write(struct.pack("<Q", len(observed)) + observed.tobytes())
+    with atomic_path(folder / "points3D.bin") as path, path.open("wb") as file:
+        file.write(struct.pack("<Q", len(xyz)))
+        for row, track in enumerate(_tracks(images, len(xyz))):
+            file.write(struct.pack("<Q3d3Bd", row + 1, *xyz[row], *rgb[row], error[row]))
+            file.write(struct.pack("<Q", len(track)) + track.astype("<u4").tobytes())
 
 
 def _tracks(images: Sequence[ModelImage], num_points: int) -> list[np.ndarray]:
@@ -74,49 +89,3 @@ def _pose(image: ModelImage) -> list[float]:
     """The image's pose as qw qx qy qz tx ty tz, world to camera."""
     quat = Rotation.from_matrix(image.w2c[:3, :3]).as_quat(canonical=True, scalar_first=True)
     return [*quat.tolist(), *np.asarray(image.w2c[:3, 3], float).tolist()]
-
-
-def _write_binary(folder, cameras, images, xyz, rgb, error, tracks) -> None:
-    with atomic_path(folder / "cameras.bin") as path, path.open("wb") as file:
-        file.write(struct.pack("<Q", len(cameras)))
-        for c in cameras:
-            file.write(struct.pack("<IiQQ", c.id, CAMERA_MODELS[c.model].id, c.width, c.height))
-            file.write(np.array(c.params, "<f8").tobytes())
-    with atomic_path(folder / "images.bin") as path, path.open("wb") as file:
-        file.write(struct.pack("<Q", len(images)))
-        for i in images:
-            file.write(struct.pack("<I7dI", i.id, *_pose(i), i.camera_id) + i.name.encode() + b"\0")
-            observed = np.empty(len(i.uv), [("uv", "<f8", 2), ("point", "<i8")])
-            observed["uv"] = i.uv
-            observed["point"] = np.where(i.point_rows >= 0, i.point_rows + 1, -1)
-            file.write(struct.pack("<Q", len(observed)) + observed.tobytes())
-    with atomic_path(folder / "points3D.bin") as path, path.open("wb") as file:
-        file.write(struct.pack("<Q", len(xyz)))
-        for row, track in enumerate(tracks):
-            file.write(struct.pack("<Q3d3Bd", row + 1, *xyz[row], *rgb[row], error[row]))
-            file.write(struct.pack("<Q", len(track)) + track.astype("<u4").tobytes())
-
-
-def _write_text(folder, cameras, images, xyz, rgb, error, tracks) -> None:
-    with atomic_path(folder / "cameras.txt") as path, path.open("w", encoding="utf-8") as file:
-        file.write("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n")
-        for c in cameras:
-            file.write(f"{c.id} {c.model} {c.width} {c.height} {_numbers(c.params)}\n")
-    with atomic_path(folder / "images.txt") as path, path.open("w", encoding="utf-8") as file:
-        file.write(
-            "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
-        )
-        for i in images:
-            file.write(f"{i.id} {_numbers(_pose(i))} {i.camera_id} {i.name}\n")
-            ids = np.where(i.point_rows >= 0, i.point_rows + 1, -1)
-            file.write(" ".join(f"{_numbers(uv)} {p}" for uv, p in zip(i.uv, ids, strict=True)) + "\n")
-    with atomic_path(folder / "points3D.txt") as path, path.open("w", encoding="utf-8") as file:
-        file.write("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n")
-        for row, track in enumerate(tracks):
-            colour = " ".join(str(int(v)) for v in rgb[row])
-            pairs = " ".join(map(str, track.ravel().tolist()))
-            file.write(f"{row + 1} {_numbers(xyz[row])} {colour} {_numbers([error[row]])} {pairs}\n")
-
-
-def _numbers(values) -> str:
-    return " ".join(repr(float(v)) for v in values)  # repr reads back identical

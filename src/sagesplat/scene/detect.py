@@ -6,19 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sagesplat.core.errors import SceneError
-from sagesplat.scene import stored
+from sagesplat.scene import scans, stored
 from sagesplat.scene.colmap import load_colmap
 from sagesplat.scene.find_model import MODEL_FILES, USUAL, model_folders
-from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTOS, folders_of
+from sagesplat.scene.find_photos import NOT_PHOTOS, folders_of, holds_photos
 from sagesplat.scene.nerfstudio import load_blender, load_transforms
-from sagesplat.scene.scans import (
-    is_metashape,
-    is_polycam,
-    is_record3d,
-    load_metashape,
-    load_polycam,
-    load_record3d,
-)
 from sagesplat.scene.scene import Scene
 
 VIDEOS = frozenset(
@@ -33,16 +25,16 @@ class CaptureFormat:
     files: tuple[str, ...]  # in the capture's folder: one of them is there
     load: Callable[..., Scene]  # (path, downscale=, test_every=, images=, fisheye=) -> the scene
     suffix: str | None = None  # of other files that stand for a capture
-    holds: Callable[[Path], bool] = lambda folder: False  # or this says that the folder is one
+    holds: Callable[[Path], object] = lambda folder: False  # or this finds something in a folder that is one
 
 
 CAPTURES = {
     "colmap": CaptureFormat(tuple(f"{place}/{name}" for place in USUAL for name in MODEL_FILES), load_colmap),
     "transforms": CaptureFormat(("transforms.json",), load_transforms, suffix=".json"),
     "blender": CaptureFormat(("transforms_train.json",), load_blender),
-    "polycam": CaptureFormat((), load_polycam, holds=is_polycam),
-    "record3d": CaptureFormat((), load_record3d, holds=is_record3d),
-    "metashape": CaptureFormat((), load_metashape, suffix=".xml", holds=is_metashape),
+    "polycam": CaptureFormat((), scans.load_polycam, holds=scans.polycam_cameras),
+    "record3d": CaptureFormat((), scans.load_record3d, holds=scans.is_record3d),
+    "metashape": CaptureFormat((), scans.load_metashape, suffix=".xml", holds=scans.metashape_file),
 }
 
 
@@ -77,7 +69,7 @@ def locate(path: Path) -> tuple[str, Path]:
     if model_folders(path):
         return "colmap", path
     photos = [each for each in below if not each.name.lower().startswith(NOT_PHOTOS)]
-    if any(_holds_photos(folder) for folder in (path, *photos)):
+    if any(holds_photos(folder) for folder in (path, *photos)):
         return "photos", path
     looked_for = ", ".join(name for capture in CAPTURES.values() for name in capture.files)
     raise SceneError(
@@ -108,9 +100,3 @@ def _of_file(path: Path) -> str:
         f"{path}: neither a transforms .json, an .xml of Metashape nor a video; give one of these, or a "
         "folder (unpack archives)"
     )
-
-
-def _holds_photos(folder: Path) -> bool:
-    if not folder.is_dir():
-        return False
-    return any(file.suffix.lower() in PHOTOS and file.is_file() for file in folder.iterdir())

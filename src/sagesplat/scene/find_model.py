@@ -7,7 +7,14 @@ from pathlib import Path
 
 from sagesplat.core.errors import SceneError, short
 from sagesplat.scene.colmap_read import model_file, read_names
-from sagesplat.scene.find_photos import NOT_PHOTOS, PHOTO_FOLDERS, PHOTOS, Found, PhotoFolder, folders_of
+from sagesplat.scene.find_photos import (
+    NOT_PHOTOS,
+    PHOTO_FOLDERS,
+    Found,
+    PhotoFolder,
+    folders_of,
+    holds_photos,
+)
 
 MODEL_FILES = ("cameras.bin", "cameras.txt")
 USUAL = ("sparse/0", "sparse")  # where models are, below a capture
@@ -131,16 +138,8 @@ def _places(path: Path, folder: Path) -> Iterator[list[Path]]:
     yield [each / name for each in above for name in names if (each / name).is_dir()]
     below = [(each, folders_of(each)) for each in above]
     photos = [
-        [one for one in inside if not one.name.lower().startswith(NOT_PHOTOS) and _holds_photos(one)]
+        [one for one in inside if not one.name.lower().startswith(NOT_PHOTOS) and holds_photos(one)]
         for _, inside in below
     ]
     yield [place for each, inside in zip(above, photos, strict=True) for place in (*inside, each)]
     yield [one for _, inside in below for one in inside if one.name.lower().startswith("images_")]
-
-
-def _holds_photos(folder: Path) -> bool:
-    try:
-        with os.scandir(folder) as listing:
-            return any(os.path.splitext(entry.name)[1].lower() in PHOTOS for entry in listing)
-    except OSError:
-        return False

@@ -190,6 +190,17 @@ def folders_of(folder: Path) -> list[Path]:
         return []
 
 
+def holds_photos(folder: Path) -> bool:
+    """Whether a folder has a photo in it, whatever is in the folders below; not where it cannot be read."""
+    try:
+        with os.scandir(folder) as listing:
+            return any(
+                os.path.splitext(entry.name)[1].lower() in PHOTOS and entry.is_file() for entry in listing
+            )
+    except OSError:
+        return False
+
+
 def _walk(
     folder: Path, below: str, depth: int, skipped: tuple[str, ...], seen: set[tuple[int, int]]
 ) -> Iterator[str]:

@@ -93,8 +93,13 @@ def photo_gains(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Seque
     points, views = tracks.points, tracks.views
     if len(points) >= _ENOUGH * len(rows):
         logs = np.log(tracks.colours + OFFSET)
-        explained = _explained(points, views, logs, len(rows))
-        gains = _fit(points, views, logs, len(rows))
+
+        def fit(some: slice | np.ndarray) -> Float64[np.ndarray, "V 3"]:
+            of_channel = (log_gains(points[some], views[some], log[some], len(rows)) for log in logs.T)
+            return np.stack([*of_channel], 1)
+
+        explained = cross_validated(points, logs, lambda a, b: logs[b] - fit(a)[views[b]])
+        gains = fit(slice(None))
         forward = np.stack([scene.views[row].camera.w2c[2, :3] for row in rows]).astype(np.float64)
         return Gains(_relative(gains), "tracks", explained, _by_direction(gains.mean(1), forward))
     ev = [exposure_of(scene.views[row].image_path) for row in rows]
@@ -102,29 +107,6 @@ def photo_gains(scene: Scene, photos: Photos | Sequence[np.ndarray], rows: Seque
         found = np.array(ev, np.float64)[:, None].repeat(3, 1) * np.log(2) / CURVE
         return Gains(_relative(found), "EXIF")
     return Gains(np.ones((len(rows), 3), np.float32), "nothing")
-
-
-def _fit(
-    points: Int64[np.ndarray, " T"],
-    views: Int64[np.ndarray, " T"],
-    logs: Float64[np.ndarray, "T 3"],
-    count: int,
-) -> Float64[np.ndarray, "V 3"]:
-    return np.stack([log_gains(points, views, channel, count) for channel in logs.T], 1)
-
-
-def _explained(
-    points: Int64[np.ndarray, " T"],
-    views: Int64[np.ndarray, " T"],
-    logs: Float64[np.ndarray, "T 3"],
-    count: int,
-) -> float:
-    """Share by which gains bring together the colours of points that they were not fitted to."""
-
-    def left(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return logs[b] - _fit(points[a], views[a], logs[a], count)[views[b]]
-
-    return cross_validated(points, logs, left)
 
 
 def _by_direction(gains: Float64[np.ndarray, " V"], forward: Float64[np.ndarray, "V 3"]) -> float:
@@ -139,17 +121,6 @@ def _by_direction(gains: Float64[np.ndarray, " V"], forward: Float64[np.ndarray,
 def _relative(logs: Float64[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 3"]:
     gain = np.exp(np.clip(logs - logs.mean(0), -3, 3))
     return (gain / gain.mean(0)).astype(np.float32)
-
-
-class _Eliminated(LinearOperator):
-    """diag(diagonal) - table^T diag(1 / per_point) table, not multiplied out."""
-
-    def __init__(self, table: csr_array, per_point: np.ndarray, diagonal: np.ndarray) -> None:
-        super().__init__(np.float64, (len(diagonal), len(diagonal)))
-        self._table, self._per_point, self._diagonal = table, per_point, diagonal
-
-    def _matvec(self, x: np.ndarray) -> np.ndarray:
-        return self._diagonal * x - self._table.T @ (self._table @ x / self._per_point)
 
 
 def log_gains(
@@ -172,7 +143,11 @@ def log_gains(
         per_point = np.maximum(np.bincount(points, weight), 1e-9)
         per_view = np.bincount(views, weight, count)
         point_sums, view_sums = np.bincount(points, weight * logs), np.bincount(views, weight * logs, count)
-        matrix = _Eliminated(table, per_point, per_view + _PRIOR)
+
+        def eliminated(x: np.ndarray, table=table, per_point=per_point, per_view=per_view) -> np.ndarray:
+            return (per_view + _PRIOR) * x - table.T @ (table @ x / per_point)  # not multiplied out
+
+        matrix = LinearOperator((count, count), eliminated, dtype=np.float64)  # type: ignore
         gain, _ = cg(matrix, view_sums - table.T @ (point_sums / per_point), x0=gain, rtol=1e-4)
         colour = (point_sums - table @ gain) / per_point
         errors = logs - gain[views] - colour[points]

@@ -65,7 +65,7 @@ class GivenMasks:
     def places(self) -> list[Path]:
         """The folders, and the files among the photos that may be masks by their names."""
         named = [path for name, path in self._among.items() if "mask" in PurePosixPath(name).name]
-        return [*self.folders, *(path for path in named if not _is_below(path, self.folders))]
+        return [*self.folders, *(path for path in named if not any(map(path.is_relative_to, self.folders)))]
 
     def of(self, photo: str) -> GivenMask | None:
         """The mask of a photo, by its name below the folder of the photos."""
@@ -88,10 +88,6 @@ def masks_of(scene: Scene, folder: Path | None = None) -> GivenMasks:
     view = scene.views[0]
     photos = view.image_path.parents[view.photo_name.count("/")]
     return GivenMasks([scene.path, photos.parent], photos, folder)
-
-
-def _is_below(path: Path, folders: Sequence[Path]) -> bool:
-    return any(path.is_relative_to(folder) for folder in folders)
 
 
 def _key(path: PurePath) -> str:

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, UInt8
-from PIL import Image
+from PIL import Image, ImageFile
 
 from sagesplat.core.errors import SceneError
 from sagesplat.io.colour_profile import in_srgb
@@ -20,33 +21,35 @@ _LOOKED_AT = 8  # photos that decide what transparent pixels mean
 _HUGE = 180 * 10**6  # pixels
 
 
+@contextmanager
+def _opened(path: Path, decodes: bool = True) -> Iterator[ImageFile.ImageFile]:
+    """`open_picture` of a photo; SceneError for what cannot be used."""
+    try:
+        with open_picture(path, decodes=decodes) as image:
+            yield image
+    except PictureError as error:
+        cure = error.cure or "replace the file, or remove it from the model"
+        raise SceneError(f"{path}: not readable as a photo ({error.reason}); {cure}") from None
+
+
 def photo_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, before EXIF rotation, from the file's header. Raises SceneError."""
-    try:
-        with open_picture(path, decodes=False) as image:
-            return image.size
-    except PictureError as error:
-        raise _unreadable(path, error) from None
+    with _opened(path, decodes=False) as image:
+        return image.size
 
 
 def has_alpha(path: Path) -> bool:
     """Whether a photo has an alpha channel, from the file's header. Raises SceneError."""
-    try:
-        with open_picture(path, decodes=False) as image:
-            return image.has_transparency_data
-    except PictureError as error:
-        raise _unreadable(path, error) from None
+    with _opened(path, decodes=False) as image:
+        return image.has_transparency_data
 
 
 def load_alpha(path: Path) -> UInt8[np.ndarray, "h w"]:
     """Opacity of each pixel of a photo, 255 where it has no alpha channel. Raises SceneError."""
-    try:
-        with open_picture(path) as image:
-            if not image.has_transparency_data or image.mode.startswith("I"):
-                return np.full((image.height, image.width), 255, np.uint8)
-            return np.array(image.convert("RGBA").getchannel("A"))
-    except PictureError as error:
-        raise _unreadable(path, error) from None
+    with _opened(path) as image:
+        if not image.has_transparency_data or image.mode.startswith("I"):
+            return np.full((image.height, image.width), 255, np.uint8)
+        return np.array(image.convert("RGBA").getchannel("A"))
 
 
 def cut_out(paths: Sequence[Path]) -> bool:
@@ -94,13 +97,10 @@ def load_photo(view: View) -> UInt8[np.ndarray, "H W 3"]:
     Memory: up to 24 bytes for each pixel of the file, whose number `open_picture` limits.
     """
     size = _size_to_read(view)
-    try:
-        with open_picture(view.image_path) as file:
-            if file.width * file.height > _HUGE:
-                file.draft(None, size)  # JPEG: decodes at a half, a quarter or an eighth of the size
-            image = as_rgb(file, view.camera.background)
-    except PictureError as error:
-        raise _unreadable(view.image_path, error) from None
+    with _opened(view.image_path) as file:
+        if file.width * file.height > _HUGE:
+            file.draft(None, size)  # JPEG: decodes at a half, a quarter or an eighth of the size
+        image = as_rgb(file, view.camera.background)
     if image.size != size and (view.lens is None or not view.lens.face or image.width > 1.5 * size[0]):
         image = image.resize(size, Image.Resampling.BOX)  # first, as undistortion costs more per pixel
     photo = undistort(np.array(image), view.lens, view.camera, order=1)
@@ -242,8 +242,3 @@ def _strips(image: Image.Image) -> Iterator[tuple[int, Image.Image]]:
     rows = max(1, _STRIP // image.width)
     for top in range(0, image.height, rows):
         yield top, image.crop((0, top, image.width, min(top + rows, image.height)))
-
-
-def _unreadable(path: Path, error: PictureError) -> SceneError:
-    cure = error.cure or "replace the file, or remove it from the model"
-    return SceneError(f"{path}: not readable as a photo ({error.reason}); {cure}")

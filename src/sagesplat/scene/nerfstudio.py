@@ -21,19 +21,9 @@ from sagesplat.core.geometry import NO_OFFSET, Position, offset_of
 from sagesplat.core.names import check_photo, repaired
 from sagesplat.io.files import read_json
 from sagesplat.io.typed import convert_as, refused
+from sagesplat.scene import loading
 from sagesplat.scene.find_photos import Found, PhotoFolder, plain
 from sagesplat.scene.images import has_alpha, photo_size
-from sagesplat.scene.loading import (
-    MAX_SIDE,
-    MIN_VIEWS,
-    Fisheye,
-    at_downscale,
-    check_found,
-    check_settings,
-    describe_lenses,
-    describe_photos,
-    views_of,
-)
 from sagesplat.scene.points import random_points, read_points, seen_or_random
 from sagesplat.scene.scene import Camera, Lens, Scene, View
 from sagesplat.scene.undistort import SPHERE, pinhole
@@ -117,7 +107,7 @@ def load_transforms(
     downscale: int = 1,
     test_every: int = 8,
     images: Path | None = None,
-    fisheye: Fisheye = "crop",
+    fisheye: loading.Fisheye = "crop",
     content: dict[str, Any] | None = None,
 ) -> Scene:
     """The scene of nerfstudio's or instant-ngp's transforms.json; `path` is the file or its folder.
@@ -132,7 +122,7 @@ def load_transforms(
     SceneError.
     """
     file = path if path.suffix == ".json" or content else path / "transforms.json"
-    check_settings(path, downscale, test_every)
+    loading.check_settings(path, downscale, test_every)
     transforms, frames = _read(file, content)
     offset, points = offset_of(_positions(frames)), None
     if transforms.ply_file_path is not None:
@@ -155,7 +145,7 @@ def load_transforms(
     folder = file.parent
     return Scene(
         repaired(folder.resolve().name), folder, ordered, points, test_every, test_names=test_names,
-        notes=(*notes, *describe_lenses(ordered)), offset=offset,
+        notes=(*notes, *loading.describe_lenses(ordered)), offset=offset,
     )  # fmt: skip
 
 
@@ -186,7 +176,7 @@ def load_blender(
     downscale: int = 1,
     test_every: int = 8,
     images: Path | None = None,
-    fisheye: Fisheye = "crop",
+    fisheye: loading.Fisheye = "crop",
 ) -> Scene:
     """The scene of a NeRF Blender folder: transforms_train.json, and transforms_test.json or else _val.
 
@@ -194,7 +184,7 @@ def load_blender(
     `test_every` 0 all are training views. Photos with alpha are of a cut-out object, composited over white.
     The initial points are random in the cube [-1.3, 1.3]^3. Raises SceneError.
     """
-    check_settings(path, downscale, test_every)
+    loading.check_settings(path, downscale, test_every)
     folder = path.parent if path.suffix == ".json" else path
     train = folder / "transforms_train.json"
     tests = next(
@@ -284,7 +274,7 @@ def _points_file(file: Path, value: Any) -> Path:
 
 
 def _views(
-    file: Path, frames: Sequence[_Frame], downscale: int, images: Path | None, fisheye: Fisheye
+    file: Path, frames: Sequence[_Frame], downscale: int, images: Path | None, fisheye: loading.Fisheye
 ) -> tuple[list[tuple[str, list[View]]], list[str]]:
     """Of each frame whose photo is there its file_path and its views; and what is to be said about them.
 
@@ -293,12 +283,12 @@ def _views(
     written = [_written(file, "file_path", frame.file_path) for frame in frames]
     root = images or file.parent
     photos = PhotoFolder(root).find(written)
-    check_found(photos, file.name)
+    loading.check_found(photos, file.name)
     if all(name.startswith("images/") for name in photos.files.values()):
         root = root / "images"
         files = {name: found.removeprefix("images/") for name, found in photos.files.items()}
         photos = Found(root, written, files, prefix="images/")
-    sized, divisor = at_downscale(photos, downscale)
+    sized, divisor = loading.at_downscale(photos, downscale)
     there = [frame for frame, name in zip(frames, written, strict=True) if name in photos.files]
     masks = _masks(file, there)
     by_frame: list[tuple[str, list[View]]] = []
@@ -309,7 +299,7 @@ def _views(
         try:
             lens, w2c = _lens(frame, root / below), frame.world_to_camera()
             valid = None if frame.mask_path is None else masks[frame.mask_path]
-            views = views_of(below, sized[name], w2c, lens, divisor, fisheye, valid)
+            views = loading.views_of(below, sized[name], w2c, lens, divisor, fisheye, valid)
         except ValueError as error:
             reason = short(error)
             raise SceneError(
@@ -318,7 +308,7 @@ def _views(
         by_frame.append((name, views))
         if frame.transform_matrix is not None:
             scales.append(float(np.linalg.norm(frame.transform_matrix[:3, 0])))
-    notes = describe_photos(photos)
+    notes = loading.describe_photos(photos)
     if np.abs(np.subtract(scales, 1)).max() > MAX_SHEAR:
         notes.append(f"the axes of the poses are {np.median(scales):.3g} long; their scale is left out")
     return by_frame, notes
@@ -351,7 +341,7 @@ def _lens(frame: _Frame, photo: Path) -> Lens:
         width, height = photo_size(photo)
     else:
         width, height = round(frame.w), round(frame.h)
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+    if not (0 < width <= loading.MAX_SIDE and 0 < height <= loading.MAX_SIDE):
         raise ValueError(f"size {width} x {height} is out of range")
     if model in SPHERES:  # the photo is the whole sphere, whatever its focal length is said to be
         return Lens(SPHERE, (float(width), float(height)), width, height)
@@ -455,6 +445,8 @@ def _sorted(file: Path, views: Sequence[View], test_names: frozenset[str] | None
         if a.name == b.name:
             raise SceneError(f"{file}: the frames name {a.name!r} twice; remove one of them")
     count = sum(view.name not in (test_names or ()) for view in ordered)
-    if count < MIN_VIEWS:
-        raise SceneError(f"{file}: {count} posed photos to train on, but it takes {MIN_VIEWS}; add some")
+    if count < loading.MIN_VIEWS:
+        raise SceneError(
+            f"{file}: {count} posed photos to train on, but it takes {loading.MIN_VIEWS}; add some"
+        )
     return ordered

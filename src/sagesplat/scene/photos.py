@@ -20,8 +20,8 @@ from sagesplat.core.limits import Count, Number
 from sagesplat.io.files import write_json
 from sagesplat.io.typed import check_limits, convert_as, known_json
 from sagesplat.scene._prepare import PreparedPhoto, prepare_photos
-from sagesplat.scene.detect import PHOTOS
 from sagesplat.scene.feature_masks import OfPhoto, write_feature_masks
+from sagesplat.scene.find_photos import PHOTOS
 from sagesplat.scene.raw_photos import REPORT, describe_raw
 from sagesplat.scene.video import extract_frames
 

@@ -12,6 +12,7 @@ of its manual, appendix D.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 from xml.etree import ElementTree
@@ -37,14 +38,9 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # between cameras that look along z, 
 _METASHAPE_CURE = "export the cameras again (File, Export, Export Cameras, Agisoft XML)"
 
 
-def is_polycam(folder: Path) -> bool:
-    """Whether a folder is Polycam's export of raw data."""
-    return _polycam_cameras(folder) is not None
-
-
 def load_polycam(path: Path, **reading: Any) -> Scene:
     """The scene of Polycam's raw data; `reading` as of `load_transforms`. Raises SceneError."""
-    cameras = _polycam_cameras(path)
+    cameras = polycam_cameras(path)
     if cameras is None:
         raise SceneError(f"{path}: no keyframes/ with cameras; export Polycam's raw data again")
     kind = "corrected_" if cameras.name == "corrected_cameras" else ""
@@ -56,8 +52,8 @@ def load_polycam(path: Path, **reading: Any) -> Scene:
     return _scene(path, cameras, frames, photos, notes, reading)
 
 
-def _polycam_cameras(folder: Path) -> Path | None:
-    """The folder with the poses: corrected ones, where there are some."""
+def polycam_cameras(folder: Path) -> Path | None:
+    """Of Polycam's export of raw data the folder with the poses: corrected ones, where there are some."""
     names = [name for name in ("corrected_cameras", "cameras") if (folder / "keyframes" / name).is_dir()]
     places = [folder / "keyframes" / name for name in names]
     if not names and folder.name == "keyframes":
@@ -65,42 +61,19 @@ def _polycam_cameras(folder: Path) -> Path | None:
     return next((place for place in places if next(place.glob("*.json"), None)), None)
 
 
-@dataclass(frozen=True)
-class _PolycamCamera:
-    """A camera of Polycam: t_ij are row i of camera to world."""
-
-    fx: _Number
-    fy: _Number
-    cx: _Number
-    cy: _Number
-    width: _Number
-    height: _Number
-    t_00: _Number
-    t_01: _Number
-    t_02: _Number
-    t_03: _Number
-    t_10: _Number
-    t_11: _Number
-    t_12: _Number
-    t_13: _Number
-    t_20: _Number
-    t_21: _Number
-    t_22: _Number
-    t_23: _Number
-
-    def frame(self, photo: str) -> dict[str, Any]:
-        rows = [[getattr(self, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-        return {
-            "file_path": photo, "w": self.width, "h": self.height, "fl_x": self.fx, "fl_y": self.fy,
-            "cx": self.cx, "cy": self.cy, "transform_matrix": rows,
-        }  # fmt: skip
-
-
 def _polycam_frame(file: Path) -> dict[str, Any]:
+    """The frame of a camera of Polycam, whose t_ij are row i of camera to world."""
+    rows = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
     content = read_json(file, "export the raw data again", SceneError)
     with refused(file, "a camera of Polycam", "export the raw data again", SceneError):
-        camera = convert_as(content, _PolycamCamera)
-    return camera.frame(file.stem)
+        camera = convert_as(content, dict[str, Any])
+        names = ["fx", "fy", "cx", "cy", "width", "height", *chain(*rows)]
+        camera = convert_as({name: camera.get(name) for name in names}, dict[str, _Number])
+    return {
+        "file_path": file.stem, "w": camera["width"], "h": camera["height"],
+        "fl_x": camera["fx"], "fl_y": camera["fy"], "cx": camera["cx"], "cy": camera["cy"],
+        "transform_matrix": [[camera[name] for name in row] for row in rows],
+    }  # fmt: skip
 
 
 def is_record3d(folder: Path) -> bool:
@@ -153,12 +126,8 @@ def load_record3d(path: Path, **reading: Any) -> Scene:
     return _scene(path, file, frames, photos, notes, reading)
 
 
-def is_metashape(folder: Path) -> bool:
-    """Whether a folder holds an XML file of Metashape's cameras."""
-    return _metashape_file(folder) is not None
-
-
-def _metashape_file(folder: Path) -> Path | None:
+def metashape_file(folder: Path) -> Path | None:
+    """The XML file of Metashape's cameras in a folder, where it holds one."""
     return next((file for file in sorted(folder.glob("*.xml")) if is_metashape_xml(file)), None)
 
 
@@ -177,7 +146,7 @@ def load_metashape(path: Path, **reading: Any) -> Scene:
 
     Photos are found by the cameras' labels, beside the file or below it. SceneError.
     """
-    file = path if path.is_file() else _metashape_file(path)
+    file = path if path.is_file() else metashape_file(path)
     if file is None:
         raise SceneError(f"{path}: no XML file of Metashape's cameras; {_METASHAPE_CURE}")
     try:

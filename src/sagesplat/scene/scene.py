@@ -22,9 +22,7 @@ class Camera:
     width: int
     height: int
     background: tuple[int, int, int] = (0, 0, 0)  # RGB; photos with alpha are composited over it
-    exposure: Float32[np.ndarray, "3 4"] | None = (
-        None  # photo's colours = E[:, :3] @ rgb + E[:, 3]; None: rgb
-    )
+    exposure: Float32[np.ndarray, "3 4"] | None = None  # photo's colours = E[:, :3] @ rgb + E[:, 3]
 
     @property
     def neutral(self) -> "Camera":

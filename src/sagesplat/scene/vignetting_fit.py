@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from sagesplat.scene.gains import cross_validated, log_gains
 from sagesplat.scene.images import Photos
 from sagesplat.scene.scene import STEEPEST, Scene, Vignetting
-from sagesplat.scene.track_colours import TrackColours, track_colours
+from sagesplat.scene.track_colours import track_colours
 from sagesplat.scene.vignetting import CURVE, OFFSET, powers
 
 _ENOUGH = 30  # observations of a photo, on average
@@ -35,7 +35,9 @@ def estimate_vignetting(scene: Scene, photos: Photos | Sequence[np.ndarray]) -> 
     if len(seen.points) < _ENOUGH * max(1, len(rows)) or seen.points.max(initial=-1) + 1 < _POINTS:
         return None
     points, views = seen.points, seen.views
-    log, t = np.log(seen.colours + OFFSET).mean(1), _tan2_of(scene, seen, rows)
+    K = np.stack([scene.views[row].camera.K for row in rows]).astype(np.float64)[views]
+    log = np.log(seen.colours + OFFSET).mean(1)
+    t = (((seen.uv - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]) ** 2).sum(1)  # tan^2 of the angles to the axes
     reach = float(t.max())
     basis, found = powers(t, reach), np.zeros(2)
     plain = full = log - log_gains(points, views, log, len(rows))[views]
@@ -46,20 +48,18 @@ def estimate_vignetting(scene: Scene, photos: Photos | Sequence[np.ndarray]) -> 
     vignetting = Vignetting((a, b), reach)
     if max(abs(a), abs(b)) > STEEPEST or vignetting.lost < _LEAST:
         return None
-    if _explained(points, plain, full, basis) < _EXPLAINED:
-        return None
-    return vignetting
+
+    def left(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return (full[b] - basis[b] @ _lens(points[a], full[a], basis[a]))[:, None]
+
+    # log values less the photos' gains, found without and with the lens
+    explained = cross_validated(points, plain[:, None], left)
+    return vignetting if explained >= _EXPLAINED else None
 
 
 def with_vignetting(scene: Scene, vignetting: Vignetting | None) -> Scene:
     """The scene whose photos are read without this vignetting; None: as they are."""
     return replace(scene, views=tuple(replace(view, vignetting=vignetting) for view in scene.views))
-
-
-def _tan2_of(scene: Scene, seen: TrackColours, rows: Sequence[int]) -> Float64[np.ndarray, " T"]:
-    """tan^2 of the angle between each observation and its optical axis."""
-    K = np.stack([scene.views[row].camera.K for row in rows]).astype(np.float64)[seen.views]
-    return (((seen.uv - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]) ** 2).sum(1)
 
 
 def _lens(
@@ -80,20 +80,3 @@ def _lens(
         scale = 2 * 1.4826 * float(np.median(np.abs(errors))) + 1e-4
         weight = 1 / (1 + (errors / scale) ** 2) ** 2
     return found
-
-
-def _explained(
-    points: Int64[np.ndarray, " T"],
-    plain: Float64[np.ndarray, " T"],
-    full: Float64[np.ndarray, " T"],
-    basis: Float64[np.ndarray, "T 2"],
-) -> float:
-    """Share by which the lens brings together the colours of points that it was not fitted to.
-
-    plain, full: log values less the photos' gains, found without and with the lens.
-    """
-
-    def left(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return (full[b] - basis[b] @ _lens(points[a], full[a], basis[a]))[:, None]
-
-    return cross_validated(points, plain[:, None], left)

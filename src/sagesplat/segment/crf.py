@@ -5,8 +5,6 @@ one of place alone. Mean-field inference filters the probabilities with both in 
 filter is a permutohedral lattice (Adams et al., Eurographics 2010), the second is separable.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 from scipy.ndimage import gaussian_filter
@@ -15,58 +13,49 @@ from scipy.special import softmax
 from sagesplat.kernels.jit import njit
 
 _LEAST = 1e-5  # probability: no label is impossible
-
-
-@dataclass(frozen=True)
-class CrfConfig:
-    """Parameters of the CRF; the defaults are those of DeepLabV2's public checkpoints."""
-
-    iterations: int = 10
-    bilateral_weight: float = 4.0
-    bilateral_xy_std: float = 67.0  # pixels
-    bilateral_rgb_std: float = 3.0  # of 0 ... 255
-    spatial_weight: float = 3.0
-    spatial_xy_std: float = 1.0  # pixels
+# the parameters of DeepLabV2's public checkpoints
+ITERATIONS = 10
+BILATERAL_WEIGHT = 4.0
+BILATERAL_XY_STD, BILATERAL_RGB_STD = 67.0, 3.0  # pixels; of 0 ... 255
+SPATIAL_WEIGHT = 3.0
+SPATIAL_XY_STD = 1.0  # pixels
 
 
 def refine(
-    probabilities: Float32[np.ndarray, "C H W"],
-    photo: UInt8[np.ndarray, "H W 3"],
-    config: CrfConfig | None = None,
+    probabilities: Float32[np.ndarray, "C H W"], photo: UInt8[np.ndarray, "H W 3"]
 ) -> Float32[np.ndarray, "C H W"]:
     """The marginals after mean-field inference (Algorithm 1) from a network's probabilities.
 
     Kernels are normalised symmetrically, D^-1/2 K D^-1/2 with D the row sums of K, and a pixel counts itself,
     as in the authors' code, to which the weights belong.
     """
-    config = config or CrfConfig()
     shape = probabilities.shape
     log_p = np.log(np.maximum(probabilities, _LEAST, dtype=np.float32)).reshape(len(probabilities), -1)
-    bilateral = Lattice(bilateral_features(photo, config))
+    bilateral = Lattice(bilateral_features(photo))
     ones = np.ones((1, log_p.shape[1]), np.float32)
     bilateral_scale = 1 / np.sqrt(bilateral(ones))
-    spatial_scale = 1 / np.sqrt(_blur(ones, shape, config))
+    spatial_scale = 1 / np.sqrt(_blur(ones, shape))
     q = softmax(log_p, axis=0)
-    for _ in range(config.iterations):
-        near = spatial_scale * _blur(q * spatial_scale, shape, config)
+    for _ in range(ITERATIONS):
+        near = spatial_scale * _blur(q * spatial_scale, shape)
         similar = bilateral_scale * bilateral(q * bilateral_scale)
-        q = softmax(log_p + config.spatial_weight * near + config.bilateral_weight * similar, axis=0)
+        q = softmax(log_p + SPATIAL_WEIGHT * near + BILATERAL_WEIGHT * similar, axis=0)
     return q.reshape(shape)
 
 
-def bilateral_features(photo: UInt8[np.ndarray, "H W 3"], config: CrfConfig) -> Float64[np.ndarray, "N 5"]:
+def bilateral_features(photo: UInt8[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "N 5"]:
     """x, y and RGB of each pixel in standard deviations of the bilateral kernel."""
     v, u = np.indices(photo.shape[:2])
-    place = np.stack([u, v], 2) / config.bilateral_xy_std
-    return np.concatenate([place, photo / config.bilateral_rgb_std], 2).reshape(-1, 5)
+    place = np.stack([u, v], 2) / BILATERAL_XY_STD
+    return np.concatenate([place, photo / BILATERAL_RGB_STD], 2).reshape(-1, 5)
 
 
-def _blur(
-    x: Float32[np.ndarray, "C N"], shape: tuple[int, ...], config: CrfConfig
-) -> Float32[np.ndarray, "C N"]:
+def _blur(x: Float32[np.ndarray, "C N"], shape: tuple[int, ...]) -> Float32[np.ndarray, "C N"]:
     """The Gaussian filter of place; nothing lies outside of the image."""
-    std, images = config.spatial_xy_std, x.reshape(-1, *shape[1:])
-    return gaussian_filter(images, (0, std, std), mode="constant", truncate=4).reshape(x.shape)
+    images = x.reshape(-1, *shape[1:])
+    return gaussian_filter(images, (0, SPATIAL_XY_STD, SPATIAL_XY_STD), mode="constant", truncate=4).reshape(
+        x.shape
+    )
 
 
 class Lattice:

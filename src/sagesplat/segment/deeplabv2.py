@@ -47,6 +47,7 @@ Head = Literal["coco-stuff", "voc"]
 HEADS: Mapping[Head, int] = {"coco-stuff": 182, "voc": 21}  # outputs
 MEAN_BGR = (104.008, 116.669, 122.675)  # what the checkpoints' inputs have subtracted, of 0 ... 255
 SCALES = (1.0, 0.75, 0.5)
+SIZE = 513  # pixels of a photo's longer side: what the checkpoints were tested at
 RATES = (6, 12, 18, 24)  # of the convolutions in the head: ASPP-L in the paper
 BLOCKS = (3, 4, 23, 3)  # ResNet-101
 
@@ -294,27 +295,17 @@ def head_classes(head: Head) -> HeadClasses:
 class DeepLabV2Segmenter:
     """The network with what its outputs mean: a `segmenters.Segmenter`.
 
-    A photo is resized to `size` pixels along its longer side (None: as it is; the checkpoints were tested at
-    513) and seen at all `SCALES`. Probabilities of outputs of one category are summed before the label image
-    is chosen. With `crf`, `crf.refine` has them first, at the size that the network sees. `device` is auto,
-    cpu, cuda or cuda:N.
+    A photo is resized to `SIZE` pixels along its longer side and seen at all `SCALES`. Probabilities of
+    outputs of one category are summed before the label image is chosen. With `crf`, `crf.refine` has them
+    first, at the size that the network sees. `device` is auto, cpu, cuda or cuda:N.
     """
 
-    def __init__(
-        self,
-        model: DeepLabV2,
-        classes: HeadClasses,
-        *,
-        size: int | None = 513,
-        crf: bool = False,
-        device: str = "cpu",
-    ):
-        outputs, label_ids = classes.outputs, classes.label_ids
-        self.taxonomy, self.size, self.crf = classes.taxonomy, size, crf
+    def __init__(self, model: DeepLabV2, classes: HeadClasses, *, crf: bool = False, device: str = "cpu"):
+        self.taxonomy, self.crf = classes.taxonomy, crf
         self._device = torch_device(device)
         self._model = model.eval().to(self._device)
-        self._ids, rows = group_classes(label_ids)
-        self._outputs = [np.array(outputs)[rows == k] for k in range(len(self._ids))]
+        self._ids, rows = group_classes(classes.label_ids)
+        self._outputs = [np.array(classes.outputs)[rows == k] for k in range(len(self._ids))]
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[Segmented]:
         """The label image of each photo."""
@@ -322,7 +313,7 @@ class DeepLabV2Segmenter:
 
     @torch.inference_mode()
     def _segment(self, photo: UInt8[np.ndarray, "H W 3"]) -> Segmented:
-        small = _to_size(photo, self.size)
+        small = _to_size(photo)
         ranks = self._scores(small)
         if self.crf:
             ranks = _refine(F.softmax(_resize(ranks, small.shape[:2]), 1)[0].numpy(), small)
@@ -338,10 +329,10 @@ class DeepLabV2Segmenter:
         return torch.stack([logits[:, outputs].logsumexp(1) for outputs in self._outputs], 1)
 
 
-def _to_size(photo: UInt8[np.ndarray, "H W 3"], size: int | None) -> UInt8[np.ndarray, "h w 3"]:
-    """The photo with a longer side of `size` pixels (bilinear, antialiased where it shrinks)."""
+def _to_size(photo: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The photo with a longer side of `SIZE` pixels (bilinear, antialiased where it shrinks)."""
     height, width = photo.shape[:2]
-    scale = 1 if size is None else size / max(height, width)
+    scale = SIZE / max(height, width)
     new = (max(1, round(width * scale)), max(1, round(height * scale)))
     return np.array(Image.fromarray(photo).resize(new, Image.Resampling.BILINEAR))
 

@@ -42,7 +42,6 @@ class Finder(Protocol):
 
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"], /) -> Found:
         """What is in a photo."""
-        ...
 
 
 def without_duplicates(boxes: Boxes) -> Boxes:
@@ -87,7 +86,9 @@ def segmented(found: Found, label_ids: Sequence[int], threshold: float, size: tu
     winner = np.full(size, UNLABELLED, np.int16)
     order = np.argsort(-found.scores, kind="stable")
     for number, row in enumerate(order.tolist()):
-        logits = _resized(found.masks[row], width, height)
+        logits = found.masks[row]
+        if logits.shape != size:
+            logits = np.asarray(Image.fromarray(logits).resize((width, height), Image.Resampling.BILINEAR))
         value = sure[row] * (1 / (1 + np.exp(-logits.clip(-30, 30))))
         wins = (logits > 0) & (value > best)
         best[wins], winner[wins] = value[wins], number
@@ -120,9 +121,3 @@ def _renumbered(numbers: Int16[np.ndarray, "H W"]) -> Int16[np.ndarray, "H W"]:
     """The same with 0, 1, ... for the numbers that occur; -1 stays."""
     present = np.unique(numbers[numbers >= 0])
     return np.where(numbers >= 0, np.searchsorted(present, numbers), -1).astype(np.int16)
-
-
-def _resized(plane: Float32[np.ndarray, "h w"], width: int, height: int) -> Float32[np.ndarray, "H W"]:
-    if plane.shape == (height, width):
-        return plane
-    return np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BILINEAR))

@@ -11,15 +11,8 @@ import torch
 from jaxtyping import Float32, UInt8
 from torch import Tensor
 
+from sagesplat.segment import hub
 from sagesplat.segment.detections import Boxes, without_duplicates
-from sagesplat.segment.hub import (
-    finite,
-    load_image_processor,
-    load_model,
-    load_tokenizer,
-    package,
-    prepared,
-)
 
 _SEPARATORS = "[CLS]", "[SEP]", ".", "?"  # tokens at which Grounding DINO ends a phrase
 _MOST = 300  # boxes of a photo, those with the highest scores
@@ -31,7 +24,6 @@ class Scorer(Protocol):
 
     def __call__(self, inputs: Any, /) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
         """Scores for each prompt; boxes as centre, width and height, as parts of the network's input."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +40,8 @@ class Detector:
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"], threshold: float) -> Boxes:
         """The boxes with a score of at least the threshold."""
         height, width = photo.shape[:2]
-        scores, parts = self.score(prepared(self.processor, [photo], self.name).to(self.device))
-        scores, parts = finite(scores, self.name), finite(parts, self.name)
+        scores, parts = self.score(hub.prepared(self.processor, [photo], self.name).to(self.device))
+        scores, parts = hub.finite(scores, self.name), hub.finite(parts, self.name)
         best, side = scores.max(0), max(width, height)
         corners = np.concatenate([parts[:, :2] - parts[:, 2:] / 2, parts[:, :2] + parts[:, 2:] / 2], 1)
         corners = corners * np.tile(np.array([side, side] if self.pads else [width, height], np.float32), 2)
@@ -142,9 +134,9 @@ def detector(
     warn: Callable[[str], None],
 ) -> Detector:
     """The detector of a folder, for these words."""
-    processor, tokenizer = load_image_processor(folder), load_tokenizer(folder)
-    kind = package("transformers").AutoModelForZeroShotObjectDetection
-    model = load_model(kind, folder, name, config).to(device).eval()
+    processor, tokenizer = hub.load_image_processor(folder), hub.load_tokenizer(folder)
+    kind = hub.package("transformers").AutoModelForZeroShotObjectDetection
+    model = hub.load_model(kind, folder, name, config).to(device).eval()
     pads = config.model_type == "owlv2"
     score = (Owlv2 if pads else GroundingDino)(model, tokenizer, words, name, warn)
     return Detector(name, device, processor, score, pads)

@@ -37,7 +37,7 @@ class Edited:
     """What became of the categories of a folder of masks."""
 
     taxonomy: Taxonomy  # those that are left
-    table: Table  # what `apply` takes
+    table: Table
     shares: dict[str, float]  # of all pixels, by category that is left
     dropped: dict[str, float]  # share of all pixels that `keep` made unlabelled, by category
     folded: dict[str, float]  # the same for `min_share`
@@ -54,7 +54,7 @@ def parse_names(text: str, option: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(",")) if text.strip() else ()
     if "" in names:
         raise LabelError(f"{option} {short(repr(text))}: a name is empty; write NAME,NAME")
-    return tuple(dict.fromkeys(_named(name, option) for name in names))
+    return tuple(dict.fromkeys(named(name, option) for name in names))
 
 
 def parse_merge(text: str) -> dict[str, str]:
@@ -74,7 +74,7 @@ def parse_merge(text: str) -> dict[str, str]:
     return resolve(merge)
 
 
-def _named(name: str, option: str) -> str:
+def named(name: str, option: str) -> str:
     """A name that was typed, as it may be; LabelError where it may not."""
     try:
         return checked(name)
@@ -84,7 +84,7 @@ def _named(name: str, option: str) -> str:
 
 def resolve(merge: Mapping[str, str]) -> dict[str, str]:
     """The same with chains followed to their end; LabelError for a circle, and for what is no name."""
-    merge = {_named(old, "merge"): _named(new, "merge") for old, new in merge.items()}
+    merge = {named(old, "merge"): named(new, "merge") for old, new in merge.items()}
     ends = {}
     for old in merge:
         chain = [old]
@@ -103,7 +103,7 @@ def edit_table(
     merge: Mapping[str, str] = NO_MERGE,
     ignore: Sequence[str] = (),
 ) -> tuple[Taxonomy, Table]:
-    """The categories that are left and the table that `apply` takes: `merge`, `ignore`, `keep` (empty: all).
+    """The categories that are left and their ids: `merge`, `ignore`, `keep` (empty: all).
 
     `merge` maps a category to the one it goes into: one of the taxonomy, `unlabelled`, or a new one, which
     gets COCO panoptic's id where that is its name and the id is free, else the first free id from 201 on.
@@ -141,11 +141,6 @@ def ignored_ids(
     unseen = [name for name in ignore if name not in after.values()]
     _check_known(Taxonomy(after), [name for name in unseen if name not in coco.NAMES.values()], "ignore")
     return [label_id for label_id, name in after.items() if name in ignore], unseen
-
-
-def apply(label_ids: Int16[np.ndarray, "*S"], table: Table) -> Int16[np.ndarray, "*S"]:
-    """Label ids of any shape after an edit; -1 stays -1."""
-    return table[label_ids]
 
 
 def count_pixels(label_ids: Int16[np.ndarray, "*S"], taxonomy: Taxonomy) -> Int64[np.ndarray, " M"]:
@@ -212,7 +207,7 @@ def edit_labels(
     table = fold[table]
     _prepare(folder, target, views, before, left)
     for row, view in enumerate(views):
-        write_mask(mask_path(target, view), apply(_valid_only(masks[view], valid[view]), table), left)
+        write_mask(mask_path(target, view), table[_valid_only(masks[view], valid[view])], left)
         if on_view:
             on_view(len(views) + row + 1, total)
     write_labels(target, left, set(left.names))

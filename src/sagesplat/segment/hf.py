@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,22 +19,7 @@ from torch.nn.functional import interpolate
 
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import LabelError, short
-from sagesplat.segment import coco
-from sagesplat.segment.hub import (
-    computing,
-    finite,
-    folder_of,
-    load_image_processor,
-    load_model,
-    load_tokenizer,
-    loading,
-    model_setting,
-    package,
-    prepared,
-    quiet,
-    read_config,
-    torch_device,
-)
+from sagesplat.segment import coco, hub
 from sagesplat.segment.instances import is_thing
 from sagesplat.segment.masks import UNLABELLED, Taxonomy
 from sagesplat.segment.panoptic import instances_of
@@ -49,6 +34,22 @@ from sagesplat.segment.segmenters import (
 DEFAULT_MODEL = "tue-mps/coco_panoptic_eomt_small_640_2x"
 FAMILIES = ("detr", "eomt", "eomt_dinov3", "mask2former", "maskformer", "oneformer")
 _MASK2FORMER_SIZE = (384, 384)  # where its own post-processing adds up masks, whatever the input's size
+
+
+class _Answer(NamedTuple):
+    """What a network says of photos of one size, or of the crops that EoMT cut them into."""
+
+    weights: Float32[Tensor, "B Q K"]  # of each query: the probability of each category, without "no object"
+    masks: Float[Tensor, "B Q h w"]  # logits
+    input_size: tuple[int, int]  # of the network's input
+    size: tuple[int, int]  # that the photo has in it: padding is right and below
+    crops: list[list[int]]  # of each: its photo, start and end along the longer side; none: whole photos
+
+    def without_padding(self, maps: Tensor) -> tuple[slice, slice]:
+        """The rows and columns of maps of the input that show the photo."""
+        of = zip(maps.shape[-2:], self.size, self.input_size, strict=True)
+        height, width = (max(1, round(o * s / f)) for o, s, f in of)
+        return slice(height), slice(width)
 
 
 class HfSegmenter:
@@ -68,12 +69,12 @@ class HfSegmenter:
         threads: int | None = None,
     ):
         self._name = str(model)
-        self._device = torch_device(device)
+        self._device = hub.torch_device(device)
         if threads is not None:
             torch.set_num_threads(threads)
-        with quiet():
-            folder = folder_of(model)
-            self._config = read_config(folder, self._name, FAMILIES, "universal segmentation")
+        with hub.quiet():
+            folder = hub.folder_of(model)
+            self._config = hub.read_config(folder, self._name, FAMILIES, "universal segmentation")
             self._processor, self._task, self._model = _load(folder, self._name, self._config)
         self._model.to(self._device).eval()
         names = [str(name) for _, name in sorted(self._config.id2label.items())]
@@ -89,55 +90,40 @@ class HfSegmenter:
         """Label images; photos of one size are computed together."""
         if len({photo.shape for photo in photos}) > 1:
             return [found for photo in photos for found in self([photo])]
-        with computing(self._name, self._device, len(photos)):
+        with hub.computing(self._name, self._device, len(photos)):
             return self._segment(photos) if photos else []
 
     @torch.inference_mode()
     def _segment(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[Segmented]:
         height, width = photos[0].shape[:2]
-        inputs = prepared(self._processor, photos, self._name)
-        weights, masks = self._queries(inputs)
-        size = self._covered(inputs, height, width)
-        if inputs.get("patch_offsets"):
-            images = self._merged(weights, masks, inputs, size, len(photos))
-        else:
-            images = (self._cropped(*of_photo, inputs, size) for of_photo in zip(weights, masks, strict=True))
-        scores = (finite(image, self._name) for image in images)
+        answer = self._answer(hub.prepared(self._processor, photos, self._name), height, width)
+        images = (self._merged if answer.crops else self._cropped)(answer, len(photos))
+        scores = (hub.finite(image, self._name) for image in images)
         found = [Segmented(self._ids[arg_max_resized(of, height, width)]) for of in scores]
         if not self.instances:
             return found
         return [
-            replace(answer, instances=self._instances(photo, weights, masks, inputs, size, height, width))
-            for photo, answer in enumerate(found)
+            replace(one, instances=self._instances(photo, answer, height, width))
+            for photo, one in enumerate(found)
         ]
 
-    def _instances(
-        self,
-        photo: int,
-        weights: Float32[Tensor, "B Q K"],
-        masks: Float[Tensor, "B Q h w"],
-        inputs: Any,
-        size: tuple[int, int],
-        height: int,
-        width: int,
-    ) -> Int16[np.ndarray, "H W"]:
+    def _instances(self, photo: int, answer: _Answer, height: int, width: int) -> Int16[np.ndarray, "H W"]:
         """Instances of things in one photo, of all crops that it was cut into."""
-        if not inputs.get("patch_offsets"):
-            full, of = inputs["pixel_values"].shape[-2:], masks.shape[-2:]
-            h, w = (max(1, round(o * s / f)) for o, s, f in zip(of, size, full, strict=True))
-            crops, places = [(weights[photo], masks[photo][:, :h, :w])], [np.s_[0:height, 0:width]]
+        weights, masks, (h, w) = answer.weights, answer.masks, answer.size
+        if not answer.crops:
+            of_photo = masks[photo][:, *answer.without_padding(masks)]
+            crops, places = [(weights[photo], of_photo)], [np.s_[0:height, 0:width]]
             return instances_of(crops, places, self._things, (height, width))
         crops, places = [], []
-        tall, scale = size[0] > size[1], (height / size[0] if size[0] > size[1] else width / size[1])
-        for row, (of_photo, start, end) in enumerate(torch.stack(inputs["patch_offsets"]).tolist()):
+        tall, scale = h > w, (height / h if h > w else width / w)
+        for row, (of_photo, start, end) in enumerate(answer.crops):
             if of_photo == photo:
                 begin, stop = round(start * scale), round(end * scale)
                 crops.append((weights[row], masks[row]))
                 places.append(np.s_[begin:stop, 0:width] if tall else np.s_[0:height, begin:stop])
         return instances_of(crops, places, self._things, (height, width))
 
-    def _queries(self, inputs: Any) -> tuple[Float32[Tensor, "B Q K"], Float[Tensor, "B Q h w"]]:
-        """Per query: the probability of each category, "no object" left out, and the logits of its mask."""
+    def _answer(self, inputs: Any, height: int, width: int) -> _Answer:
         pixels = inputs["pixel_values"].to(self._device)
         more = {"pixel_mask": inputs["pixel_mask"].to(self._device)} if "pixel_mask" in inputs else {}
         if self._task is not None:
@@ -149,7 +135,11 @@ class HfSegmenter:
         detr = self._config.model_type == "detr"
         logits = output.logits if detr else output.class_queries_logits
         masks = output.pred_masks if detr else output.masks_queries_logits
-        return logits.float().softmax(-1)[..., :-1] @ self._members, masks
+        weights = logits.float().softmax(-1)[..., :-1] @ self._members
+        offsets = inputs.get("patch_offsets")
+        crops = torch.stack(offsets).tolist() if offsets else []
+        size = self._covered(inputs, height, width)
+        return _Answer(weights, masks, tuple(pixels.shape[-2:]), size, crops)
 
     def _covered(self, inputs: Any, height: int, width: int) -> tuple[int, int]:
         """Height and width of the photo in the network's input, which has padding right and below."""
@@ -163,50 +153,30 @@ class HfSegmenter:
         size = self._processor.size
         return get_size_with_aspect_ratio((height, width), size["shortest_edge"], size["longest_edge"])
 
-    def _scores(
-        self, weights: Float32[Tensor, "Q K"], masks: Float[Tensor, "Q h w"], inputs: Any
-    ) -> Float32[Tensor, "K h2 w2"]:
+    def _scores(self, answer: _Answer, row: int) -> Float32[Tensor, "K h2 w2"]:
         """Semantic inference, at the resolution where the family's own post-processing does it."""
-        masks, family = masks.float()[None], self._config.model_type
+        masks, family = answer.masks[row].float()[None], self._config.model_type
         if family == "mask2former":
             masks = interpolate(masks, _MASK2FORMER_SIZE, mode="bilinear")
         elif family.startswith("eomt"):
-            masks = interpolate(masks, inputs["pixel_values"].shape[-2:], mode="bilinear")
-        return torch.einsum("qk,qhw->khw", weights, masks[0].sigmoid())
+            masks = interpolate(masks, answer.input_size, mode="bilinear")
+        return torch.einsum("qk,qhw->khw", answer.weights[row], masks[0].sigmoid())
 
-    def _cropped(
-        self,
-        weights: Float32[Tensor, "Q K"],
-        masks: Float[Tensor, "Q h w"],
-        inputs: Any,
-        size: tuple[int, int],
-    ) -> Float32[Tensor, "K h2 w2"]:
-        """Scores of one photo without those of the input's padding."""
-        scores = self._scores(weights, masks, inputs)
-        of, full = scores.shape[-2:], inputs["pixel_values"].shape[-2:]
-        h, w = (max(1, round(o * s / f)) for o, s, f in zip(of, size, full, strict=True))
-        return scores[:, :h, :w]
+    def _cropped(self, answer: _Answer, photos: int) -> Iterator[Float32[Tensor, "K h2 w2"]]:
+        """Scores of each photo without those of the input's padding."""
+        for scores in (self._scores(answer, photo) for photo in range(photos)):
+            yield scores[:, *answer.without_padding(scores)]
 
-    def _merged(
-        self,
-        weights: Float32[Tensor, "B Q K"],
-        masks: Float[Tensor, "B Q h w"],
-        inputs: Any,
-        size: tuple[int, int],
-        photos: int,
-    ) -> Iterator[Float32[Tensor, "K h2 w2"]]:
+    def _merged(self, answer: _Answer, photos: int) -> Iterator[Float32[Tensor, "K h2 w2"]]:
         """Scores of each photo from those of the crops that EoMT cut it into; means where they overlap."""
+        device, (height, width) = answer.weights.device, answer.size
         for photo in range(photos):
-            total = torch.zeros(len(self._ids), *size, device=weights.device)
-            count = torch.zeros(size, device=weights.device)
-            for row, (of, start, end) in enumerate(torch.stack(inputs["patch_offsets"]).tolist()):
-                if of == photo:
-                    along = (
-                        (..., slice(start, end), slice(None))
-                        if size[0] > size[1]
-                        else (..., slice(start, end))
-                    )
-                    total[along] += self._scores(weights[row], masks[row], inputs)
+            total = torch.zeros(len(self._ids), height, width, device=device)
+            count = torch.zeros(height, width, device=device)
+            for row, (of_photo, start, end) in enumerate(answer.crops):
+                if of_photo == photo:
+                    along = np.s_[..., start:end, :] if height > width else np.s_[..., start:end]
+                    total[along] += self._scores(answer, row)
                     count[along] += 1
             yield total / count.clamp(min=1)
 
@@ -245,23 +215,23 @@ def _load(folder: Path, name: str, config: Any) -> tuple[Any, Int64[Tensor, "1 T
     oneformer = config.model_type == "oneformer"
     # class_info_file would be downloaded, and serves training alone
     alone = {"class_info_file": None} if oneformer else {}
-    with loading(name):
-        processor = load_image_processor(folder, **alone)
+    with hub.loading(name):
+        processor = hub.load_image_processor(folder, **alone)
         task = _task_tokens(folder, config) if oneformer else None
-        kind = package("transformers").AutoModelForUniversalSegmentation
-        return processor, task, load_model(kind, folder, name, config)
+        kind = hub.package("transformers").AutoModelForUniversalSegmentation
+        return processor, task, hub.load_model(kind, folder, name, config)
 
 
 def _task_tokens(folder: Path, config: Any) -> Int64[Tensor, "1 T"]:
     """What OneFormer is asked for, padded with 0 as in its training."""
-    tokens = load_tokenizer(folder)(
+    tokens = hub.load_tokenizer(folder)(
         ["the task is semantic"], padding="max_length", max_length=config.task_seq_len, truncation=True
     )
     return torch.tensor(tokens["input_ids"]) * torch.tensor(tokens["attention_mask"])
 
 
 def _settings(config: MasksConfig) -> dict[str, Any]:
-    return {"model": model_setting(config.model or DEFAULT_MODEL)}
+    return {"model": hub.model_setting(config.model or DEFAULT_MODEL)}
 
 
 def _load_segmenter(

@@ -11,23 +11,8 @@ from sagesplat.core.errors import LabelError
 from sagesplat.io.pictures import FREE_PIXELS
 from sagesplat.scene.raw_photos import raw_photos
 from sagesplat.scene.scene import Scene
-from sagesplat.segment import coco
+from sagesplat.segment import coco, masks
 from sagesplat.segment.fit import fit
-from sagesplat.segment.masks import (
-    UNLABELLED,
-    VOID_8,
-    VOID_16,
-    Taxonomy,
-    given_png,
-    num_pixels,
-    prepare_folder,
-    read_labels,
-    read_png,
-    taxonomy_of,
-    translated,
-    write_labels,
-    write_mask,
-)
 
 
 def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
@@ -60,13 +45,13 @@ def import_masks(scene: Scene, source: Path, target: Path) -> list[str]:
             f"({PurePosixPath(missing[0]).with_suffix('.png')}, ...)"
         )
     occurring, raw = set[int](), raw_photos(scene.path)
-    for view, path in zip(scene.views, prepare_folder(target, scene.views), strict=True):
-        label_ids = np.full((view.camera.height, view.camera.width), UNLABELLED, np.int16)
+    for view, path in zip(scene.views, masks.prepare_folder(target, scene.views), strict=True):
+        label_ids = np.full((view.camera.height, view.camera.width), masks.UNLABELLED, np.int16)
         if (file := found[view.name]) is not None:
-            label_ids = fit(file.read(num_pixels(view)), view, raw.get(view.name), file.path)
-        write_mask(path, label_ids, taxonomy)
+            label_ids = fit(file.read(masks.num_pixels(view)), view, raw.get(view.name), file.path)
+        masks.write_mask(path, label_ids, taxonomy)
         occurring.update(np.unique(label_ids).tolist())
-    write_labels(target, taxonomy, occurring)
+    masks.write_labels(target, taxonomy, occurring)
     return missing
 
 
@@ -81,13 +66,15 @@ class _File:
 
     def read(self, free: int) -> Int16[np.ndarray, "h w"]:
         """Category ids at the file's own size; `free` as in `read_mask`."""
-        return translated(read_png(self.path, free, self.segments), self.ids, self.path, self.cure)
+        return masks.translated(
+            masks.read_png(self.path, free, self.segments), self.ids, self.path, self.cure
+        )
 
 
 _Find = Callable[[str], _File | None]  # by the name of a photo
 
 
-def label_images_of(folder: Path) -> tuple[Taxonomy, Callable[[str], Int16[np.ndarray, "h w"] | None]]:
+def label_images_of(folder: Path) -> tuple[masks.Taxonomy, Callable[[str], Int16[np.ndarray, "h w"] | None]]:
     """The categories of a folder as `import_masks` takes it, and what reads an image by its photo's name.
 
     None for a photo without one. LabelError as of `import_masks`.
@@ -101,27 +88,27 @@ def label_images_of(folder: Path) -> tuple[Taxonomy, Callable[[str], Int16[np.nd
     return taxonomy, read
 
 
-def _source(folder: Path) -> tuple[Taxonomy, _Find]:
+def _source(folder: Path) -> tuple[masks.Taxonomy, _Find]:
     if not folder.is_dir():
         raise LabelError(f"{folder}: no such folder; name the one with the label images")
     return _id_source(folder) if (folder / "labels.json").exists() else _panoptic_source(folder)
 
 
-def _id_source(folder: Path) -> tuple[Taxonomy, _Find]:
+def _id_source(folder: Path) -> tuple[masks.Taxonomy, _Find]:
     """Images of ids with a labels.json."""
-    taxonomy, unlabelled = read_labels(folder / "labels.json")
-    voids = (VOID_8, VOID_16) if unlabelled is None else (unlabelled,)
-    ids = dict.fromkeys(voids, UNLABELLED) | {i: i for i in taxonomy.names}
+    taxonomy, unlabelled = masks.read_labels(folder / "labels.json")
+    voids = (masks.VOID_8, masks.VOID_16) if unlabelled is None else (unlabelled,)
+    ids = dict.fromkeys(voids, masks.UNLABELLED) | {i: i for i in taxonomy.names}
     cure = 'name them in labels.json (or say there which value is "unlabelled")'
 
     def find(name: str) -> _File | None:
-        path = given_png(folder, name)
+        path = masks.given_png(folder, name)
         return None if path is None else _File(path, ids, False, cure)
 
     return taxonomy, find
 
 
-def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
+def _panoptic_source(folder: Path) -> tuple[masks.Taxonomy, _Find]:
     """COCO panoptic PNGs with the JSON of their segments."""
     panoptic = coco.read_panoptic(folder)
     if panoptic is None:
@@ -129,14 +116,14 @@ def _panoptic_source(folder: Path) -> tuple[Taxonomy, _Find]:
             f"{folder}: no labels.json, and not the two values of masks of what counts; write one like "
             '{"unlabelled": 255, "labels": {"184": "tree-merged"}}'
         )
-    taxonomy = taxonomy_of(panoptic.names, folder)
+    taxonomy = masks.taxonomy_of(panoptic.names, folder)
 
     def find(name: str) -> _File | None:
         key = str(PurePosixPath(name).with_suffix(""))
         path = panoptic.pngs.get(key)
         if path is None or not path.exists():
             return None
-        ids = {0: UNLABELLED} | panoptic.segments[key]
+        ids = {0: masks.UNLABELLED} | panoptic.segments[key]
         return _File(path, ids, True, "they are no segments in the JSON; export image and JSON together")
 
     return taxonomy, find
@@ -159,6 +146,6 @@ def panoptic_segments(
         path = panoptic.pngs.get(str(PurePosixPath(name).with_suffix("")))
         if path is None or not path.exists():
             return None
-        return path, read_png(path, 4 * FREE_PIXELS, segments=True)
+        return path, masks.read_png(path, 4 * FREE_PIXELS, segments=True)
 
     return read

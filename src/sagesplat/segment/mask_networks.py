@@ -12,16 +12,9 @@ from torch import Tensor
 
 from sagesplat.core.errors import BackendUnavailable
 from sagesplat.io.typed import known_json
+from sagesplat.segment import hub
 from sagesplat.segment.detections import Boxes, Found
 from sagesplat.segment.detectors import padded_tokens
-from sagesplat.segment.hub import (
-    finite,
-    load_image_processor,
-    load_model,
-    load_tokenizer,
-    package,
-    prepared,
-)
 
 BOX_FAMILIES = {"sam", "sam2", "sam2_video"}
 WORD_FAMILIES = {"clipseg": 0.4, "sam3": 0.5, "sam3_video": 0.5}  # family: usual threshold
@@ -36,15 +29,15 @@ class BoxMasks:
     """SAM (Kirillov et al. 2023) or SAM 2 (Ravi et al. 2024, arXiv:2408.00714): a mask for each box."""
 
     def __init__(self, folder: Path, name: str, config: Any, device: torch.device):
-        transformers = package("transformers")
+        transformers = hub.package("transformers")
         self.name, self._device = name, device
         self._first = config.model_type == "sam"
         if self._first:
-            self._processor = load_image_processor(folder)
-            self._model = load_model(transformers.SamModel, folder, name, config)
+            self._processor = hub.load_image_processor(folder)
+            self._model = hub.load_model(transformers.SamModel, folder, name, config)
         else:
             # published folders name the network for videos, whose weights have more parts
-            self._model = load_model(transformers.Sam2Model, folder, name)
+            self._model = hub.load_model(transformers.Sam2Model, folder, name)
             self._input = _Squared(folder, 1024, _IMAGENET)
         self._model.to(device).eval()
 
@@ -65,14 +58,14 @@ class BoxMasks:
         logits = torch.cat(masks)
         full, of = pixels.shape[-2:], logits.shape[-2:]
         h, w = (max(1, round(o * c / f)) for o, c, f in zip(of, covered, full, strict=True))
-        return finite(logits[:, :h, :w], self.name)
+        return hub.finite(logits[:, :h, :w], self.name)
 
     def _prepared(self, photo: UInt8[np.ndarray, "H W 3"]) -> tuple[Tensor, tuple[int, int]]:
         """The network's input, and height and width of the photo in it; padding is right and below."""
         if not self._first:
             pixels = self._input(photo).to(self._device)
             return pixels, (pixels.shape[2], pixels.shape[3])
-        inputs = prepared(self._processor, [photo], self.name)
+        inputs = hub.prepared(self._processor, [photo], self.name)
         height, width = (int(size) for size in inputs["reshaped_input_sizes"][0])
         return inputs["pixel_values"].to(self._device), (height, width)
 
@@ -108,16 +101,16 @@ class ClipSeg:
         warn: Callable[[str], None],
     ):
         self.name, self.threshold, self._device = name, threshold, device
-        self._processor = load_image_processor(folder)
+        self._processor = hub.load_image_processor(folder)
         length = config.text_config.max_position_embeddings
-        self._text = padded_tokens(load_tokenizer(folder), words, length, name, warn).to(device)
-        kind = package("transformers").CLIPSegForImageSegmentation
-        self._model = load_model(kind, folder, name, config).to(device).eval()
+        self._text = padded_tokens(hub.load_tokenizer(folder), words, length, name, warn).to(device)
+        kind = hub.package("transformers").CLIPSegForImageSegmentation
+        self._model = hub.load_model(kind, folder, name, config).to(device).eval()
 
     @torch.inference_mode()
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"], /) -> Found:
         """What is in a photo."""
-        pixels = prepared(self._processor, [photo], self.name)["pixel_values"].to(self._device)
+        pixels = hub.prepared(self._processor, [photo], self.name)["pixel_values"].to(self._device)
         ids, mask = self._text["input_ids"], self._text["attention_mask"]
         planes = []
         for start in range(0, len(ids), _WORDS_TOGETHER):
@@ -128,7 +121,7 @@ class ClipSeg:
                 attention_mask=mask[some],
             )
             planes.append(output.logits.reshape(len(ids[some]), *output.logits.shape[-2:]))
-        logits = finite(torch.cat(planes), self.name)
+        logits = hub.finite(torch.cat(planes), self.name)
         best = 1 / (1 + np.exp(-logits.max((1, 2)).clip(-30, 30)))
         reached = np.flatnonzero(best >= self.threshold)
         level = np.float32(np.log(self.threshold / (1 - self.threshold)))
@@ -151,13 +144,13 @@ class Sam3:
         threshold: float,
         warn: Callable[[str], None],
     ):
-        kind = getattr(package("transformers"), "Sam3Model", None)
+        kind = getattr(hub.package("transformers"), "Sam3Model", None)
         if kind is None:
             raise BackendUnavailable(f"{name}: needs a transformers that has SAM 3; upgrade it")
         self.name, self.threshold, self._device = name, threshold, device
         self._input = _Squared(folder, 1008, _HALF)
-        self._text = padded_tokens(load_tokenizer(folder), words, _SAM3_TOKENS, name, warn).to(device)
-        self._model = load_model(kind, folder, name).to(device).eval()
+        self._text = padded_tokens(hub.load_tokenizer(folder), words, _SAM3_TOKENS, name, warn).to(device)
+        self._model = hub.load_model(kind, folder, name).to(device).eval()
 
     @torch.inference_mode()
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"], /) -> Found:
@@ -171,11 +164,11 @@ class Sam3:
             found = output.pred_logits[0].sigmoid()
             if output.presence_logits is not None:
                 found = found * output.presence_logits[0].sigmoid()
-            score = finite(found, self.name)
+            score = hub.finite(found, self.name)
             kept = np.flatnonzero(score >= self.threshold)
             prompts.append(np.full(len(kept), row))
             scores.append(score[kept])
-            masks.append(finite(output.pred_masks[0], self.name)[kept])
+            masks.append(hub.finite(output.pred_masks[0], self.name)[kept])
             best.append(score.max())
         rows, reached, logits = (np.concatenate(parts) for parts in (prompts, scores, masks))
         return Found(rows, reached, logits, np.array(best, np.float32))

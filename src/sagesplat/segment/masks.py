@@ -72,7 +72,7 @@ class Taxonomy:
 
 
 class Masks:
-    """The label images of a normalised folder (what `import_masks` or `segment_views` wrote), read lazily.
+    """The label images of a normalised folder (what `import_masks` or `segment_some` wrote), read lazily.
 
     Images are kept until `CACHE_BYTES` are full; the rest is read anew each time, since the stages visit all
     views in turn.

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from functools import cache
 
 from sagesplat.core.errors import LabelError, short
-from sagesplat.core.names import RULE, checked, collision_key
+from sagesplat.core.names import collision_key
 from sagesplat.segment import coco
 from sagesplat.segment.display_names import title_of
-from sagesplat.segment.edit import free_id
+from sagesplat.segment.edit import free_id, named
 from sagesplat.segment.masks import UNLABELLED_NAME
 
 _ARTICLES = {"a", "an", "the"}
@@ -33,23 +33,19 @@ def parse_prompts(text: str) -> tuple[str, ...]:
     prompts = [part.strip() for part in text.strip().removesuffix(";").split(";")]
     if "" in prompts:
         raise LabelError(f'prompts {short(repr(text))}: one is empty; write --prompts "stone fountain; ivy"')
-    named = tuple(_named(prompt) for prompt in prompts)
+    words = tuple(_named(prompt) for prompt in prompts)
     seen: dict[str | int, str] = {}
-    for prompt in named:
+    for prompt in words:
         key = _coco_ids().get(meaning(prompt), meaning(prompt))
         if key in seen:
             other = seen[key]
             raise LabelError(f"prompts: {other!r} and {prompt!r} mean the same; leave one of them")
         seen[key] = prompt
-    return named
+    return words
 
 
 def _named(prompt: str) -> str:
-    wrong = f"prompt {short(repr(prompt))}"
-    try:
-        prompt = checked(prompt)
-    except ValueError as error:
-        raise LabelError(f"{wrong}: {error}; {RULE}") from None
+    wrong, prompt = f"prompt {short(repr(prompt))}", named(prompt, "prompt")
     if found := next((c for c in _RESERVED if c in prompt), None):
         raise LabelError(f"{wrong}: {found!r} cannot be part of a category; separate prompts by ;")
     if prompt == UNLABELLED_NAME or not meaning(prompt):

@@ -7,17 +7,7 @@ import numpy as np
 from jaxtyping import Int16, Int32
 
 from sagesplat.core.errors import LabelError
-from sagesplat.formats.label_edits import (
-    Full,
-    Hide,
-    Merge,
-    Operation,
-    Rename,
-    Runs,
-    Split,
-    Weigh,
-    ranks_of,
-)
+from sagesplat.formats import label_edits
 from sagesplat.segment.edit import alternatives, free_id
 from sagesplat.segment.masks import UNLABELLED, UNLABELLED_NAME
 
@@ -91,7 +81,7 @@ class _State:
 def relabelled(
     names: Mapping[int, str],
     counts: Mapping[int, int],
-    operations: Sequence[Operation],
+    operations: Sequence[label_edits.Operation],
     *,
     weights: Mapping[str, float] | None = None,
     hidden: Sequence[str] = (),
@@ -137,21 +127,21 @@ def relabelled(
     return _result(state)
 
 
-def _apply(state: _State, operation: Operation) -> None:
+def _apply(state: _State, operation: label_edits.Operation) -> None:
     number = _find(state, operation.category)
     category = state.categories[number]
     match operation:
-        case Rename(to=to):
+        case label_edits.Rename(to=to):
             _rename(state, number, to)
-        case Merge(into=into):
+        case label_edits.Merge(into=into):
             _merge(state, number, into)
-        case Split(to=to, gaussians=gaussians):
+        case label_edits.Split(to=to, gaussians=gaussians):
             _split(state, number, to, gaussians)
-        case Hide(hidden=hidden):
+        case label_edits.Hide(hidden=hidden):
             category.hidden = hidden
-        case Weigh(weight=weight):
+        case label_edits.Weigh(weight=weight):
             category.weight = weight
-        case Full(always=always):
+        case label_edits.Full(always=always):
             category.always = always
 
 
@@ -188,7 +178,7 @@ def _merge(state: _State, number: int, into: str) -> None:
         owner[owner == number] = target
 
 
-def _split(state: _State, number: int, to: str, gaussians: Mapping[str, Runs]) -> None:
+def _split(state: _State, number: int, to: str, gaussians: Mapping[str, label_edits.Runs]) -> None:
     _check_free(state, to)
     new = len(state.categories)
     for label, runs in gaussians.items():
@@ -197,7 +187,7 @@ def _split(state: _State, number: int, to: str, gaussians: Mapping[str, Runs]) -
         owner = state.owner[state.old_ids[label]]
         if (end := sum(runs[-1])) > len(owner):
             raise LabelError(f"rank {end - 1} of {label!r}, which has {len(owner):,} Gaussians")
-        ranks = ranks_of(runs)
+        ranks = label_edits.ranks_of(runs)
         if (owner[ranks] != number).any():
             raise LabelError(f"Gaussians that are not of {state.categories[number].name!r}")
         owner[ranks] = new

@@ -24,7 +24,6 @@ from sagesplat.segment.masks import (
     mask_path,
     prepare_folder,
     read_mask,
-    write_labels,
     write_mask,
 )
 
@@ -47,7 +46,6 @@ class Segmenter(Protocol):
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
         """An answer for each photo; those of one call may be computed together."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -80,31 +78,6 @@ class PhotoList(Protocol):
     """What photos are taken from: by row of Scene.views, at the size of the view's camera."""
 
     def __getitem__(self, index: int, /) -> UInt8[np.ndarray, "H W 3"]: ...
-
-
-def segment_views(
-    scene: Scene,
-    photos: PhotoList,
-    segmenter: Segmenter,
-    target: Path,
-    *,
-    on_view: Callable[[int, int], None] | None = None,
-) -> None:
-    """Write the label image of every view with a segmentation network, then labels.json.
-
-    Args:
-        scene: The capture.
-        photos: Its photos, uint8 [H, W, 3] by row of `scene.views`.
-        segmenter: Maps photos to label images; it has a `taxonomy`.
-        target: Folder to write: PNGs named like the photos, and labels.json.
-        on_view: Called with (views done, views in all).
-
-    Raises:
-        LabelError: If the network's answer cannot be used or the folder cannot be written.
-    """
-    rows = range(len(scene.views))
-    occurring = segment_some(scene, photos, segmenter, target, rows, on_view=on_view)
-    write_labels(target, segmenter.taxonomy, occurring)
 
 
 def segment_some(

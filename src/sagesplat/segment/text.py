@@ -13,18 +13,10 @@ from jaxtyping import UInt8
 from sagesplat.core.config import MasksConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.io.typed import check_limits
+from sagesplat.segment import hub
 from sagesplat.segment.detections import Finder, painted_over, segmented, shared_areas
 from sagesplat.segment.detectors import DETECTORS, detector
 from sagesplat.segment.display_names import title_of
-from sagesplat.segment.hub import (
-    computing,
-    folder_of,
-    loading,
-    model_setting,
-    quiet,
-    read_config,
-    torch_device,
-)
 from sagesplat.segment.mask_networks import BOX_FAMILIES, WORD_FAMILIES, BoxFinder, BoxMasks, ClipSeg, Sam3
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.prompts import Prompt, parse_prompts, prompts_of
@@ -58,7 +50,7 @@ class TextSegmenter:
         return [self._segment(photo) for photo in photos]
 
     def _segment(self, photo: UInt8[np.ndarray, "H W 3"]) -> Segmented:
-        with computing("segmentation by text", self._device, 1):
+        with hub.computing("segmentation by text", self._device, 1):
             found = self._finder(photo)
         for prompt, score in zip(self._prompts, found.best.tolist(), strict=True):
             self.best[prompt.name] = max(self.best[prompt.name], score)
@@ -93,8 +85,8 @@ def settings(config: MasksConfig) -> dict[str, Any]:
     if config.segmenter == "text" and config.model and config.prompt_model:
         raise RunError("--model and --prompt-model name the same network here; leave one of them")
     return {
-        "model": model_setting(detector_of(config)),
-        "mask_model": model_setting(config.mask_model or DEFAULT_MASK_MODEL),
+        "model": hub.model_setting(detector_of(config)),
+        "mask_model": hub.model_setting(config.mask_model or DEFAULT_MASK_MODEL),
         "prompts": list(parse_prompts(config.prompts)),
         "prompt_threshold": config.prompt_threshold,
     }
@@ -113,8 +105,8 @@ def load_text(
     settings(config)
     prompts = prompts_of(parse_prompts(config.prompts), base)
     torch.set_num_threads(threads)
-    where = torch_device(device)
-    with quiet():
+    where = hub.torch_device(device)
+    with hub.quiet():
         finder = _finder(config, [title_of(prompt.words) for prompt in prompts], where, warn)
     return TextSegmenter(finder, prompts, where)
 
@@ -125,13 +117,13 @@ def _finder(
     """The networks that are asked for, loaded."""
     name = detector_of(config)
     warn(f"network {name}; if it is not on this machine yet, it is downloaded from huggingface.co")
-    folder = folder_of(name)
-    about = read_config(folder, name, _THRESHOLDS, "segmentation by text")
+    folder = hub.folder_of(name)
+    about = hub.read_config(folder, name, _THRESHOLDS, "segmentation by text")
     family = about.model_type
     threshold = config.prompt_threshold or _THRESHOLDS[family]
     if family in WORD_FAMILIES and config.mask_model:
         raise LabelError(f"{name}: a network of kind {family} makes masks itself; leave out --mask-model")
-    with loading(name, _NEEDS):
+    with hub.loading(name, _NEEDS):
         if family == "clipseg":
             return ClipSeg(folder, name, about, device, words, threshold, warn)
         if family in WORD_FAMILIES:
@@ -143,9 +135,9 @@ def _finder(
 def _box_masks(config: MasksConfig, device: torch.device, warn: Callable[[str], None]) -> BoxMasks:
     name = config.mask_model or DEFAULT_MASK_MODEL
     warn(f"network {name}; if it is not on this machine yet, it is downloaded from huggingface.co")
-    folder = folder_of(name)
-    about = read_config(folder, name, BOX_FAMILIES, "masks of boxes")
-    with loading(name):
+    folder = hub.folder_of(name)
+    about = hub.read_config(folder, name, BOX_FAMILIES, "masks of boxes")
+    with hub.loading(name):
         return BoxMasks(folder, name, about, device)
 
 

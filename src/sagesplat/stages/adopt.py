@@ -33,7 +33,7 @@ from sagesplat.scene.cameras import NamedCamera, read_camera_file
 from sagesplat.scene.colmap_write import ModelCamera, ModelImage, write_model
 from sagesplat.scene.scene import Camera, View
 from sagesplat.segment.display_names import categories
-from sagesplat.segment.edit import apply, parse_merge
+from sagesplat.segment.edit import parse_merge
 from sagesplat.segment.lift import LiftedLabels
 from sagesplat.segment.masks import (
     UNLABELLED,
@@ -48,7 +48,7 @@ from sagesplat.stages.edited import check_not_edited
 from sagesplat.stages.label import edit_of, make_masks
 from sagesplat.stages.memory import foretell_adopt
 from sagesplat.stages.scene import check_folder, open_scene, reading
-from sagesplat.train.votes import vote
+from sagesplat.train.votes import label_weights, winners
 from sagesplat.viewer.frames import FLIP, upward
 
 _WHOLE = {0: "scene"}  # the one category of a splat without labels
@@ -281,7 +281,7 @@ def _edited(job: Job, g: Gaussians) -> Gaussians:
     unseen = ~np.isin(ids, (UNLABELLED, *before.names))
     if unseen.any():
         job.emit(Warned(f"{unseen.sum():,} Gaussians of categories that no viewpoint shows are unlabelled"))
-    return replace(g, label_ids=torch.from_numpy(apply(ids, edit_of(job.run))))
+    return replace(g, label_ids=torch.from_numpy(edit_of(job.run)[ids]))
 
 
 def _parents(job: Job, path: Path, merge: Mapping[str, str]) -> dict[str, str]:
@@ -304,7 +304,8 @@ def _label(job: Job, of_file: Path | None, merge: Mapping[str, str]) -> None:
         if voted:
             views = job.scene.train_ids.tolist()
             g = replace(g, label_ids=torch.full_like(g.label_ids, UNLABELLED))
-            g = replace(g, label_ids=vote(g, job.scene, job.masks, views, antialiased=antialiased))
+            ids, weights = label_weights(g, job.scene, job.masks, views, antialiased=antialiased)
+            g = replace(g, label_ids=winners(g, ids, weights))
         else:
             g = _edited(job, g)
         points = job.scene.points.xyz

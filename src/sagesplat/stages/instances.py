@@ -22,7 +22,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.run.stage import run_stage
 from sagesplat.scene.scene import View
 from sagesplat.segment.display_names import title_of
-from sagesplat.segment.edit import apply, edit_table, parse_names
+from sagesplat.segment.edit import edit_table, parse_names
 from sagesplat.segment.instances import (
     FOLDER,
     import_instances,
@@ -115,7 +115,7 @@ def make_instances(job: Job, masks: MasksConfig, labels: LabelsConfig) -> None:
         lifted.write(run.instance_labels)
         write_parents(run.parents, {taxonomy.names[i]: taxonomy.names[p] for i, p in parents.items()})
         taxonomy.write(run.instances / "labels.json")
-        return [_line(apply(found.label_ids, table), taxonomy, parents)]
+        return [_line(table[found.label_ids], taxonomy, parents)]
 
     settings = {"instances": ",".join(wanted), "merge": ",".join(f"{a}={b}" for a, b in merge.items())}
     made = [run.provenance(stage) for stage in stages if run.provenance(stage).exists()]
@@ -186,7 +186,7 @@ def _draw(
         if hidden.any():
             behind = only.render(view.camera)
             after = np.where(hidden & (of[behind + 1] == shown), behind, after)
-        write_mask(path, apply(after, table), taxonomy)
+        write_mask(path, table[after], taxonomy)
         job.emit(Progress("instances", done + row + 1, done + len(views)))
 
 

@@ -30,9 +30,7 @@ class Votes:
     """Category votes of each Gaussian, over all views that it contributes to."""
 
     ids: Int16[np.ndarray, " C"]  # category ids in rising order, the first one -1
-    shares: Float32[
-        np.ndarray, "N C"
-    ]  # of each category in the votes; rows sum to 1, or 0 where no view voted
+    shares: Float32[np.ndarray, "N C"]  # of each category in the votes; rows sum to 1, or 0 without a vote
 
 
 @dataclass(frozen=True, eq=False)

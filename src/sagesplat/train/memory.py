@@ -10,7 +10,7 @@ from sagesplat.core.config import TrainConfig
 from sagesplat.core.errors import RunError
 from sagesplat.core.sh import num_bases
 from sagesplat.scene.scene import Scene
-from sagesplat.train.strategy import max_count
+from sagesplat.train.strategy import STRATEGIES
 
 GIB = 2**30
 _MARGIN = 0.1  # of what a machine has, left for others
@@ -50,7 +50,7 @@ def fit(scene: Scene, config: TrainConfig, limit: int = 0, *, processes: int = 1
     limit = limit or default_limit()
     camera, points = scene.views[0].camera, len(scene.points.xyz)
     pixels = camera.width * camera.height
-    most = max(max_count(config, pixels, points), points)
+    most = max(STRATEGIES[config.strategy].max_count(config, pixels, points), points)
     fixed, each = fixed_and_each(scene, config.sh_degree, limit, processes)
     needed = int(fixed + each * most)
     room = int((limit - fixed) / each)

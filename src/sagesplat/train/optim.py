@@ -75,19 +75,6 @@ def _update_chunk(chunk, parameter, grad, exp_avg, exp_avg_sq, rate, correction,
         row = stop + 1
 
 
-@njit(parallel=True, error_model="numpy", cache=True)
-def _update_rows(parameters, grads, exp_avg, exp_avg_sq, rates, correction, trainable, columns):
-    """Tuples of flat arrays of N * width values: to start threads takes as long as a small one of them."""
-    chunks, several = (len(trainable) + _CHUNK - 1) // _CHUNK, len(parameters)
-    for job in prange(chunks * several):
-        k = job % several
-        if columns[k]:
-            _update_chunk(
-                job // several, parameters[k], grads[k], exp_avg[k], exp_avg_sq[k], rates[k], correction,
-                trainable, columns[k],
-            )  # fmt: skip
-
-
 @njit(error_model="numpy", cache=True)
 def _update_drawn_chunk(
     chunk, parameter, grad, exp_avg, exp_avg_sq, rate, correction, trainable, columns, drawn
@@ -101,60 +88,48 @@ def _update_drawn_chunk(
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def _update_drawn(parameters, grads, exp_avg, exp_avg_sq, rates, correction, trainable, columns, drawn):
-    """`_update_rows` of the rows `drawn` alone."""
-    chunks, several = (len(drawn) + _CHUNK - 1) // _CHUNK, len(parameters)
-    for job in prange(chunks * several):
-        k = job % several
-        if columns[k]:
-            # by a function of its own: to take an array out of a tuple for each row costs as much as the row
-            _update_drawn_chunk(
-                job // several, parameters[k], grads[k], exp_avg[k], exp_avg_sq[k], rates[k], correction,
-                trainable, columns[k], drawn,
-            )  # fmt: skip
+def _update_rows(parameters, grads, exp_avg, exp_avg_sq, rates, correction, trainable, columns, drawn):
+    """Tuples of flat arrays of N * width values: to start threads takes as long as a small one of them.
 
-
-def adam_step(
-    parameter: np.ndarray,  # [N, ...] float32, changed in place
-    grad: np.ndarray,  # the same, or [M, ...] of the rows `drawn`
-    exp_avg: np.ndarray,  # moments, changed in place
-    exp_avg_sq: np.ndarray,
-    *,
-    lr: float,
-    step: int,  # 1 for the first
-    trainable: np.ndarray,  # bool [N]
-    columns: int | None = None,
-    drawn: np.ndarray | None = None,  # indices of M rows
-) -> None:
-    """One Adam step (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS).
-
-    `columns`: update only this many values at the start of each row; the others never had a gradient.
-    `drawn`: the other rows keep parameter and moments, as those that are not `trainable`.
+    Of the rows `drawn` alone, or where there are none of all.
     """
-    of_one = (parameter,), (grad,), (exp_avg,), (exp_avg_sq,)
-    _adam_steps(*of_one, rates=[lr], step=step, trainable=trainable, columns=[columns], drawn=drawn)
+    count = len(drawn) if len(drawn) else len(trainable)
+    chunks, several = (count + _CHUNK - 1) // _CHUNK, len(parameters)
+    for job in prange(chunks * several):
+        k, chunk = job % several, job // several
+        # chunks by functions of their own: to take an array out of a tuple costs as much as a row
+        arrays = parameters[k], grads[k], exp_avg[k], exp_avg_sq[k]
+        how = rates[k], correction, trainable, columns[k]
+        if columns[k] and len(drawn):
+            _update_drawn_chunk(chunk, *arrays, *how, drawn)
+        elif columns[k]:
+            _update_chunk(chunk, *arrays, *how)
 
 
-def _adam_steps(
+def adam_steps(
     *arrays: Sequence[np.ndarray],
     rates: Sequence[float],
-    step: int,
-    trainable: np.ndarray,
+    step: int,  # 1 for the first
+    trainable: np.ndarray,  # bool [N]
     columns: Sequence[int | None],
-    drawn: np.ndarray | None,
+    drawn: np.ndarray | None = None,  # indices of M rows
 ) -> None:
-    """`adam_step` of several parameters (`arrays`: these, their gradients and both moments)."""
+    """One Adam step of several parameters (Kingma and Ba, betas 0.9 and 0.999, eps 1e-15 as 3DGS).
+
+    `arrays`: the parameters, [N, ...] float32; their gradients, the same or [M, ...] of the rows `drawn`;
+    both moments. Parameters and moments are changed in place. `columns`: update only as many values at the
+    start of each row; the others never had a gradient. `drawn`: the other rows keep parameter and moments, as
+    those that are not `trainable`.
+    """
     n = len(trainable)
-    if not n:
+    if not n or (drawn is not None and not len(drawn)):
         return
     in_use = [a.size // n if c is None else c for a, c in zip(arrays[0], columns, strict=True)]
     per_step = np.array([lr / (1 - _BETA1**step) for lr in rates], np.float32)
     correction = np.float32((1 - _BETA2**step) ** -0.5)
     flat = [tuple(np.ascontiguousarray(a).reshape(-1) for a in several) for several in arrays]
-    if drawn is None:
-        _update_rows(*flat, per_step, correction, trainable, np.array(in_use))
-    else:
-        _update_drawn(*flat, per_step, correction, trainable, np.array(in_use), drawn)
+    drawn = np.empty(0, np.int64) if drawn is None else drawn
+    _update_rows(*flat, per_step, correction, trainable, np.array(in_use), drawn)
 
 
 def update(
@@ -191,7 +166,7 @@ def _update_some(
     tensors = parameters, grads, state.exp_avg, state.exp_avg_sq
     if not trainable.is_cuda:
         of_name = ([t[name].detach().numpy() for name in parameters] for t in tensors)
-        _adam_steps(
+        adam_steps(
             *of_name, rates=[rates[name] for name in parameters], step=state.step,
             trainable=trainable.numpy(), columns=[columns.get(name) for name in parameters],
             drawn=None if drawn is None else drawn.numpy(),

@@ -28,11 +28,7 @@ from sagesplat.train.view_parameters import ViewParameters
 _REACH = 0.03  # rad in the image: how far all steps of one view lead in one direction
 _FASTEST, _PER_VISIT = 0.004, 2.5e-4  # rad in the image: largest learning rate, and for each visit of a view
 _SHRINK_TO = 0.01  # the learning rate at the end, as a share of that at the start
-_FROM, _ROUNDS, _LATEST = (
-    0.03,
-    2,
-    0.2,
-)  # first step: share of the run, rounds of views; at most
+_FROM, _ROUNDS, _LATEST = 0.03, 2, 0.2  # first step: share of the run, rounds of views; at most
 _WARM_UP = 5  # updates of a view in which its learning rate grows
 _PRIOR = 3.0  # rad, and extents: a step of 1 rad in the image moves no camera farther than this
 _NEAREST = 0.01  # extents: points that are nearer to a camera say nothing about its motions

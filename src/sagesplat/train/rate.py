@@ -7,7 +7,6 @@ that show little become zero. HAC and ContextGS do it with learned entropy model
 import math
 
 import numpy as np
-import torch
 from jaxtyping import Float32
 from numba import prange
 from torch import Tensor
@@ -19,11 +18,6 @@ from sagesplat.kernels.simd import LANES, load, maximum, splat, store, where
 _LOG_2 = math.log(2)
 
 
-def estimated_bits(shN: Float32[Tensor, "N K 3"], sh_bits: tuple[int, int]) -> Tensor:
-    """Bits of the harmonics of each Gaussian [N], about; `sh_bits` as in `formats.quantisation`."""
-    return torch.log2(1 + shN.abs() / sh_steps(shN, sh_bits)).flatten(1).sum(1)
-
-
 def add_gradient(
     grad: Float32[Tensor, "M K 3"],
     shN: Float32[Tensor, "N K 3"],
@@ -31,9 +25,10 @@ def add_gradient(
     weight: float,
     rows: Tensor | None = None,
 ) -> None:
-    """Add the gradient of `weight` times the mean of `estimated_bits` over some rows, in place.
+    """Add the gradient of `weight` times the mean bits of the harmonics of some Gaussians, in place.
 
-    `rows`: indices [M] of those in `shN` that `grad` is of; None: all. Where a coefficient is 0 it is 0.
+    `sh_bits`: as in `formats.quantisation`. `rows`: indices [M] of those in `shN` that `grad` is of; None:
+    all. Where a coefficient is 0 it is 0.
     """
     weight /= max(len(grad), 1) * _LOG_2
     if grad.is_cuda:

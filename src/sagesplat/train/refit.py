@@ -19,13 +19,8 @@ _MOST = 2.0  # largest correction of an opacity
 _GROWS = 1.5  # largest growth of an area, where the opacity is as large as it can be
 _LEAST = 1e-3, 0.1  # opacity; blending weight, in pixels, that corrections are relative to
 _OPAQUE = 0.99
-_RATES = {
-    "sh0": 0.02,
-    "logit_opacities": 0.05,
-    "log_scales": 0.02,
-    "quats": 0.01,
-    "means": 0.05,
-}  # means: of a size
+# of Adam; that of the means is of a size
+_RATES = {"sh0": 0.02, "logit_opacities": 0.05, "log_scales": 0.02, "quats": 0.01, "means": 0.05}
 _BETAS = 0.5, 0.9  # there are few steps
 
 

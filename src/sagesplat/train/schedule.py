@@ -27,6 +27,10 @@ class Schedule:
         """Whether densification is active at a step."""
         return self.refine_start < step < self.refine_stop
 
+    def resets(self, step: int) -> bool:
+        """Whether 3DGS resets opacities at a step."""
+        return self.refines(step) and step % self.reset_every == 0
+
 
 def scaled_schedule(config: TrainConfig, refine_stop: int) -> Schedule:
     """The published step numbers scaled to `max_steps`; `refine_stop` is that of a run of 30,000 steps."""

@@ -155,16 +155,13 @@ def find_sky(
         return None
     centre = np.median([scene.views[i].camera.position for i in scene.train_ids], axis=0)
     distances = np.linalg.norm(scene.points.xyz[~np.isin(label_ids, labels)] - centre, axis=1)
-    shell = Shell(centre.astype(np.float32), _radius(distances, scene.scale), scene.scale, labels)
+    far = np.percentile(distances, _FAR_POINTS) if len(distances) else 0.0
+    radius = float(np.clip(_BEYOND * far, _LEAST * scene.scale, _MOST * scene.scale))
+    shell = Shell(centre.astype(np.float32), radius, scene.scale, labels)
     directions, colors = _with_margin(seen, rgb, spacing)
     return Sky(
         shell, (centre + shell.radius * directions).astype(np.float32), colors.round().astype(np.uint8)
     )
-
-
-def _radius(distances: np.ndarray, extent: float) -> float:
-    far = np.percentile(distances, _FAR_POINTS) if len(distances) else 0.0
-    return float(np.clip(_BEYOND * far, _LEAST * extent, _MOST * extent))
 
 
 def _spacing(scene: Scene) -> float:

@@ -36,10 +36,6 @@ class Strategy:
         """After step `state.step`: densify when the schedule says so; whether rows were added or moved."""
         return False
 
-    def resets(self, step: int) -> bool:
-        """Whether `step_post` resets opacities at a step."""
-        return False
-
 
 @dataclass(frozen=True, eq=False)
 class Densification(Strategy):
@@ -123,15 +119,11 @@ class DefaultStrategy(Densification):
     def step_post(self, state: TrainState) -> bool:
         """Refine, then reset opacities; see `Strategy`."""
         refined = super().step_post(state)
-        if self.resets(state.step):
+        if self.schedule.resets(state.step):
             trainable = trainable_rows(state.gaussians, state.frozen)
             # nothing on the shell stands before anything, and what no photo shows would never come back
             densify.reset_opacities(state, self._near(state, trainable))
         return refined
-
-    def resets(self, step: int) -> bool:
-        """Whether opacities are reset at a step: every `reset_every` steps while densification is active."""
-        return self.schedule.refines(step) and step % self.schedule.reset_every == 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +172,3 @@ def make_strategy(
 def schedule_of(config: TrainConfig) -> Schedule:
     """The step numbers of a training with `config`."""
     return STRATEGIES[config.strategy].schedule_of(config)
-
-
-def max_count(config: TrainConfig, num_pixels: int, num_points: int) -> int:
-    """How many Gaussians a training with `config` can reach (see `Densification.max_count`)."""
-    return STRATEGIES[config.strategy].max_count(config, num_pixels, num_points)

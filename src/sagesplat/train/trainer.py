@@ -100,7 +100,9 @@ def train(
         >>> for event in train_gaussians(scene, Photos(scene.views), labels, TrainConfig()):  # doctest: +SKIP
         ...     print(event)
     """
-    _check(config, masks)
+    check_limits(config, "train.")
+    if config.freeze_at is not None and masks is None:
+        raise RunError("--train.freeze-at needs label images to measure categories on; bring masks")
     folder = None if folder is None else Path(folder)
     training: Training | None = None
     with named_failures(lambda: _where(training.state if training else None, folder)):
@@ -346,9 +348,3 @@ def _check_levels(checkpoint: Path, step: int) -> None:
             raise RunError(
                 f"{reason}; delete it to resume without that level, or {checkpoint} to train from the start"
             ) from None
-
-
-def _check(config: TrainConfig, masks: Masks | None) -> None:
-    check_limits(config, "train.")
-    if config.freeze_at is not None and masks is None:
-        raise RunError("--train.freeze-at needs label images to measure categories on; bring masks")

@@ -29,10 +29,6 @@ class ViewParameters:
         values, exp_avg, exp_avg_sq = (torch.zeros(views, size) for _ in range(3))
         return cls(values, exp_avg, exp_avg_sq, torch.zeros(views, dtype=torch.int64))
 
-    def leaf(self, view: int) -> Float32[Tensor, " D"]:
-        """A copy of a view's parameters that takes a gradient."""
-        return self.values[view].clone().requires_grad_()
-
     def adam_step(
         self,
         views: Sequence[int],
@@ -74,13 +70,11 @@ class ViewUpdate(Protocol):
     @property
     def first_step(self) -> int:
         """The step from which on gradients of the parameters are taken."""
-        ...
 
     def __call__(
         self, parameters: ViewParameters, views: Sequence[int], grad: Float32[Tensor, "R D"], step: int
     ) -> None:
         """Update the parameters of the views of a step from their gradients; also fixes the gauge."""
-        ...
 
 
 class ViewGradients:
@@ -92,8 +86,8 @@ class ViewGradients:
         self.grads = {name: torch.zeros_like(p.values[: len(self.views)]) for name, p in parameters.items()}
 
     def leaves(self, view: int) -> dict[str, Tensor]:
-        """The view's parameters by kind, to be used in its loss."""
-        return {name: p.leaf(view) for name, p in self.parameters.items()}
+        """Copies of the view's parameters by kind, which take gradients, to be used in its loss."""
+        return {name: p.values[view].clone().requires_grad_() for name, p in self.parameters.items()}
 
     def add(self, view: int, leaves: Mapping[str, Tensor]) -> None:
         """Take up the gradients of a view's leaves."""

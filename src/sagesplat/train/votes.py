@@ -36,17 +36,13 @@ def label_weights(
     return ids, weights
 
 
-def vote(
-    gaussians: Gaussians, scene: Scene, masks: Masks, views: Collection[int], *, antialiased: bool = False
-) -> torch.Tensor:
-    """The category (int16 [N]) that each Gaussian paints most of; its old one where no view shows it."""
-    return winners(gaussians, *label_weights(gaussians, scene, masks, views, antialiased=antialiased))
-
-
 def winners(
     gaussians: Gaussians, ids: Int16[np.ndarray, " L"], weights: Float32[np.ndarray, "N L"]
 ) -> torch.Tensor:
-    """The category of the largest weight (see `label_weights`), int16 [N]; the old one where all are 0."""
+    """The category that each Gaussian paints most of, int16 [N]; its old one where no view shows it.
+
+    `ids` and `weights` as of `label_weights`.
+    """
     best = ids[weights.argmax(1)] if len(ids) else np.full(len(gaussians), UNLABELLED, np.int16)
     seen, old = torch.from_numpy(weights.sum(1) > 0), gaussians.label_ids
     return torch.where(seen.to(old.device), torch.from_numpy(best).to(old.device), old)

@@ -26,6 +26,7 @@ from sagesplat.segment.coco import read_panoptic
 from sagesplat.segment.instances import read_instances, write_instances
 from sagesplat.segment.mask_files import import_masks
 from sagesplat.segment.masks import Taxonomy, read_mask, write_mask
+from tests.colmap_text import write_text_model
 from tests.fuzz.hostile import MIB, Reader
 from tests.fuzz.readers.making import PHOTOS, as_json, documents, file, put, put_photos, written, written_by
 
@@ -51,7 +52,8 @@ def _colmap(part: str, text: bool) -> Reader:
         images = [ModelImage(i + 1, PHOTOS[i], 1, pose, uv, seen[i]) for i, pose in enumerate(poses)]
         xyz, rgb = np.tile([[0, 0, 4.0], [1, 0, 5]], (size, 1)), np.full((count, 3), 7, np.uint8)
         cameras = [ModelCamera(i + 1, base, 16, 12, params) for i in range(size)]
-        write_model(folder / "sparse", cameras, images, xyz, rgb, np.ones(count), text=text)
+        write = write_text_model if text else write_model
+        write(folder / "sparse", cameras, images, xyz, rgb, np.ones(count))
         return [(folder / "sparse" / name).read_bytes()]
 
     read = file(f"sparse/{name}", lambda path: load_colmap(path.parents[1]))

@@ -25,6 +25,7 @@ from sagesplat.io.typed import check_limits
 from sagesplat.metrics.color_correct import color_correct_affine
 from sagesplat.metrics.image import pasted
 from sagesplat.metrics.lpips import Lpips
+from sagesplat.output.tables import mean
 from sagesplat.raster import Workspace
 from sagesplat.run.executor import Local
 from sagesplat.run.job import Job
@@ -42,26 +43,7 @@ from sagesplat.stages.plan import PAPER_TARGETS, ssim_target, ssim_targets
 from sagesplat.stages.results import increments_of
 from sagesplat.stages.shared import inlier_inputs, train_config
 from sagesplat.stages.snapshots import Snapshots
-from sagesplat.studies.compare.report import (
-    CONSOLE,
-    FILE,
-    MCMC,
-    MEASURES,
-    PAGE,
-    PLANNED,
-    PRUNED,
-    SAGE,
-    SAME_SHARE,
-    SNAPSHOTS,
-    OfLabel,
-    Point,
-    Walk,
-    make_tables,
-    read_comparison,
-    walk,
-    write_comparison,
-    write_report,
-)
+from sagesplat.studies.compare import report
 from sagesplat.studies.lpips import features_of, load_metrics, lpips_hashes
 from sagesplat.studies.paper.same_size import nearest_snapshot, prune_to
 from sagesplat.train.importance import importance
@@ -84,14 +66,14 @@ class Contender:
     budget: float = np.nan  # bytes that it was planned for
 
 
-def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[Point]:
+def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[report.Point]:
     """Train what is missing of the baselines, measure all sets on the test views, write RUN/compare.
 
     `job` is one on the nested ladder. compare.json has every point; `copy` becomes the same. RunError for a
     run without a finished nested ladder or without test views, and for impossible settings.
     """
     _check(job, config)
-    folder, file = _folder(job), _folder(job) / FILE
+    folder, file = _folder(job), _folder(job) / report.FILE
     lpips = lpips_hashes(config.lpips)
     targets = list(config.targets) or sorted({*PAPER_TARGETS, *ssim_targets(job.run)})
     settings = json.loads(json.dumps(asdict(config) | {"targets": targets, "lpips": lpips}))
@@ -110,28 +92,28 @@ def compare(job: Job, config: CompareConfig, copy: Path | None = None) -> list[P
         ]
         points = measure_sets(job, contenders, load_metrics(job.emit, config.lpips))
         walks = _walks(nested, sage)
-        (folder / PAGE).unlink(missing_ok=True)  # it shows what was measured before
-        write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))
+        (folder / report.PAGE).unlink(missing_ok=True)  # it shows what was measured before
+        report.write_comparison(file, points, walks, scene=job.scene.name, views=len(job.scene.test_ids))
         return [f"{len(points)} sets in {len(job.scene.test_ids)} test views"]
 
     run = job.run
     inputs = [run.labels, *method_of(job).files, run.observations, *compose_inputs(job)]
     inputs += [snapshots.run.models, *trained]
     run_stage(job, "compare", settings, inputs, [file], make)
-    points, walks = read_comparison(file)
-    tables = make_tables(points, walks, ssim_target(run))
+    points, walks = report.read_comparison(file)
+    tables = report.make_tables(points, walks, ssim_target(run))
 
     def show() -> list[str]:
-        write_report(folder, tables, points, titles(job.names()))
+        report.write_report(folder, tables, points, titles(job.names()))
         return list(tables["table_2_baselines"].notes[:-2])
 
-    run_stage(job, "compared", {}, [file], [folder / PAGE], show)
-    for stem, columns in CONSOLE.items():
+    run_stage(job, "compared", {}, [file], [folder / report.PAGE], show)
+    for stem, columns in report.CONSOLE.items():
         table = tables[stem].only(*columns)
         job.emit(table.event)
     if copy:
         write_text(copy, file.read_text(encoding="utf-8"))
-    job.emit(RunDone(folder / PAGE))
+    job.emit(RunDone(folder / report.PAGE))
     return points
 
 
@@ -170,8 +152,8 @@ class Baseline:
     step: int
     settings: dict
     inputs: list[Path]
-    make: Callable[[Job, Any], Gaussians]
-    of: Callable[[], Any]  # what `make` needs beside the job, computed when it is
+    make: Callable[..., Gaussians]  # (job, *of)
+    of: Callable[[], tuple[Any, ...]]  # what `make` needs beside the job, computed when it is
 
 
 def pruned_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]:
@@ -187,7 +169,7 @@ def pruned_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]
 
     return [
         Baseline(
-            PRUNED, f"{share:.0%}, {steps} steps", folder / f"pruned-{share:g}-{steps}.npz",
+            report.PRUNED, f"{share:.0%}, {steps} steps", folder / f"pruned-{share:g}-{steps}.npz",
             last.step + steps, {"share": share, "tune_steps": steps}, [*job.run.scene_files, last.path],
             _prune, lambda share=share: (share, steps, weights()),
         )
@@ -195,8 +177,7 @@ def pruned_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]
     ]  # fmt: skip
 
 
-def _prune(job: Job, of: tuple[float, int, np.ndarray]) -> Gaussians:
-    share, steps, weights = of
+def _prune(job: Job, share: float, steps: int, weights: np.ndarray) -> Gaussians:
     g = read_level(job.last_level.path)
     return tune_composition(job, prune_to(g, max(1, round(share * len(g))), weights), steps)
 
@@ -210,16 +191,12 @@ def mcmc_sets(job: Job, config: CompareConfig, folder: Path) -> list[Baseline]:
         settings = {**asdict(capped_config(made, cap, made.max_steps)), "seed": seed}
         of = path.stem, cap, made.max_steps, seed
         baseline = Baseline(
-            MCMC, f"cap {share:.0%}", path, made.max_steps, settings,
+            report.MCMC, f"cap {share:.0%}", path, made.max_steps, settings,
             [*run.scene_files, run.labels, *inlier_inputs(run)],
-            _cap, lambda of=of: of,
+            train_capped, lambda of=of: of,
         )  # fmt: skip
         found.append(baseline)
     return found
-
-
-def _cap(job: Job, of: tuple[str, int, int, int]) -> Gaussians:
-    return train_capped(job, *of)
 
 
 def trained_sets(job: Job, baselines: Sequence[Baseline]) -> dict[Path, Contender]:
@@ -243,10 +220,10 @@ def _train(
         yield missing[i], [f"{count:,} Gaussians"]
 
 
-def _keep(job: Job, part: tuple[Callable[[Job, Any], Gaussians], Any, str, int]) -> int:
+def _keep(job: Job, part: tuple[Callable[..., Gaussians], tuple[Any, ...], str, int]) -> int:
     """Train one and write it; its number of Gaussians comes back."""
     make, of, name, step = part
-    g = make(job, of)
+    g = make(job, *of)
     write_set(_folder(job) / name, g, step)
     return len(g)
 
@@ -257,7 +234,7 @@ def snapshot_points(snapshots: Job, config: CompareConfig) -> list[Contender]:
     sizes = [ladder.size(level) for level in ladder.levels]
     wanted = np.geomspace(max(1, min(sizes)), max(sizes), config.snapshots)[::-1]
     picked = sorted({nearest_snapshot(ladder, round(size)) for size in wanted.tolist()})
-    return [Contender(SNAPSHOTS, f"step {i}", i, partial(ladder.load, i)) for i in picked]
+    return [Contender(report.SNAPSHOTS, f"step {i}", i, partial(ladder.load, i)) for i in picked]
 
 
 def _sage(sage: Snapshots, targets: Sequence[float], share: float) -> list[Contender]:
@@ -267,7 +244,7 @@ def _sage(sage: Snapshots, targets: Sequence[float], share: float) -> list[Conte
         plan = sage.plan_scene(target, share)
         name = f"SSIM {target:g}, {plan.status}"
         load = partial(plan.compose, ladder)
-        found.append(Contender(SAGE, name, ladder.levels[-1], load, target=target))
+        found.append(Contender(report.SAGE, name, ladder.levels[-1], load, target=target))
     return found
 
 
@@ -279,7 +256,7 @@ def prefixes(nested: NestedLevels) -> list[Contender]:
     for k in range(costs.transfer_bytes.shape[1]):
         bytes_of = dict(zip(costs.labels, costs.transfer_bytes[:, k].tolist(), strict=True))
         load = partial(job.ladder.load, k + 1)
-        found.append(Contender(SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
+        found.append(Contender(report.SAME_SHARE, f"level {k + 1}", steps, load, bytes_of))
     return found
 
 
@@ -315,13 +292,13 @@ def _of_plan(nested: NestedLevels, name: str, plan: Plan) -> Contender:
     job = nested.job
     steps = job.last_level.step + settings_of(job.run, "nest")["steps"]
     return Contender(
-        PLANNED, name, steps, partial(plan.compose, job.ladder),
+        report.PLANNED, name, steps, partial(plan.compose, job.ladder),
         {choice.label_id: choice.transfer_bytes or 0 for choice in plan.choices}, plan.target,
         np.nan if plan.budget is None else plan.budget,
     )  # fmt: skip
 
 
-def measure_sets(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips]) -> list[Point]:
+def measure_sets(job: Job, contenders: Sequence[Contender], metrics: dict[str, Lpips]) -> list[report.Point]:
     """All contenders on all test views, some at a time."""
     labels = job.level_masks
     tests, workspace, points = job.valid.rows(job.scene, job.scene.test_ids), Workspace(), []
@@ -391,14 +368,13 @@ def _values(
 
 def _point(
     contender: Contender, g: Gaussians, encoded: dict[int, int], views: list[dict[str | int, float]]
-) -> Point:
-    def mean(key: str | int) -> float:
-        values = [values[key] for values in views if np.isfinite(values.get(key, np.nan))]
-        return float(np.mean(values)) if values else np.nan
+) -> report.Point:
+    def over_views(key: str | int) -> float:
+        return mean(np.array([values.get(key, np.nan) for values in views]))
 
     counts = g.counts()
     ids = sorted({*counts, *(key for values in views for key in values if isinstance(key, int))})
-    return Point(
+    return report.Point(
         method=contender.method,
         name=contender.name,
         target=contender.target,
@@ -406,8 +382,8 @@ def _point(
         count=len(g),
         encoded=sum(encoded.values()),
         steps=contender.steps,
-        **{name: mean(name) for name in ("ssim_sent", *MEASURES)},
-        labels={i: OfLabel(counts.get(i, 0), encoded.get(i, 0), mean(i)) for i in ids},
+        **{name: over_views(name) for name in ("ssim_sent", *report.MEASURES)},
+        labels={i: report.OfLabel(counts.get(i, 0), encoded.get(i, 0), over_views(i)) for i in ids},
     )
 
 
@@ -429,7 +405,7 @@ def encode_set(job: Job, g: Gaussians) -> tuple[dict[int, int], Gaussians]:
     return {c.label_id: c.nbytes for c in increments}, arrived
 
 
-def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
+def _walks(nested: NestedLevels, sage: Snapshots) -> list[report.Walk]:
     """From view to view by name at the main target: ours with hysteresis, and the paper's plans."""
     job, costs = nested.job, nested.costs
     target, views = ssim_target(job.run), range(len(job.scene.views))
@@ -457,8 +433,8 @@ def _walks(nested: NestedLevels, sage: Snapshots) -> list[Walk]:
     }
     walks = []
     for keeps in (True, False):
-        mine = walk("nested", ours, increment_files, keeps)
+        mine = report.walk("nested", ours, increment_files, keeps)
         replacing = any(c.refine == "REPLACE" for c in increments)
         assert replacing or mine.replaced == 0, "a level must contain the ones below it"
-        walks += [mine, walk(SAGE, theirs, level_files, keeps)]
+        walks += [mine, report.walk(report.SAGE, theirs, level_files, keeps)]
     return walks

@@ -135,17 +135,16 @@ def write_report(folder: Path, measured: Measured, how: Mapping[str, Any], strip
     regions = regions_table(measured)
     regions.write_csv(folder / "levels.csv")
     views_table(measured).write_csv(folder / "views.csv")
-    levels = [dict(zip(regions.header, map(_plain, row), strict=True)) for row in regions.rows]
+    values = (
+        [None if isinstance(v, float) and not np.isfinite(v) else v for v in row] for row in regions.rows
+    )
+    levels = [dict(zip(regions.header, row, strict=True)) for row in values]
     reference = {"name": measured.reference, "Gaussians": measured.reference_count}
     write_json(
         folder / JSON,
         {"format": "sagesplat-measure", "version": 1, **how, "reference": reference, "levels": levels},
     )
     save_figure(_figure(measured, strip), folder / PICTURE)
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _mean(rows: Sequence[Row], field: str) -> float:

@@ -124,7 +124,10 @@ def _measure(
     how["settings"]["cameras"] = config.cameras and config.cameras.name
     row = worst_view(measured)
     write_report(out, measured, how, _strip(truth, levels, cameras[row], views[row], renderer))
-    _show(measured, emit)
+    columns = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.others, "SSIM covered")
+    emit(levels_table(measured).only(*columns, "worst SSIM").event)
+    if measured.labels():
+        emit(categories_table(measured).event)
     return measured
 
 
@@ -192,10 +195,3 @@ def _strip(truth: Splat, levels: Sequence[Level], camera: Camera, name: str, ren
         return (255 * picture[y : y + side, x : x + side]).round().astype(np.uint8)
 
     return Strip(name, crop(image), [crop(picture) for picture in images])
-
-
-def _show(measured: Measured, emit: Emit) -> None:
-    columns = ("level", "Gaussians", "share", "MB", "SSIM", "PSNR", *measured.others, "SSIM covered")
-    emit(levels_table(measured).only(*columns, "worst SSIM").event)
-    if measured.labels():
-        emit(categories_table(measured).event)

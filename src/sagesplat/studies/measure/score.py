@@ -79,7 +79,9 @@ def compare(
     rows: list[Row] = []
     counts: list[int] = []
     images = 0
-    labels = _labels(reference, renderer.backend)
+    labels = None
+    if int(reference.gaussians.label_ids.max()) >= 0:
+        labels = RenderedLabels(reference.gaussians, renderer.backend, reference.antialiased)
     for begin, splats in _groups(levels):
         counts += [len(splat.gaussians) for splat in splats]
         for view, camera in enumerate(cameras):
@@ -98,13 +100,6 @@ def compare(
                 images += 1
                 done(images)
     return rows, counts
-
-
-def _labels(reference: Splat, backend: Backend) -> RenderedLabels | None:
-    """Label images of the reference; None where it has no labels."""
-    if int(reference.gaussians.label_ids.max()) < 0:
-        return None
-    return RenderedLabels(reference.gaussians, backend, reference.antialiased)
 
 
 def _groups(levels: Iterable[Level]) -> Iterator[tuple[int, list[Splat]]]:

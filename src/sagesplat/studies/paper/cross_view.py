@@ -1,29 +1,22 @@
 """Cross-view evaluation: each unseen view gets a plan of its own, and masks from the 3D labels."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
 from sagesplat.adapt.ladder import Ladder
-from sagesplat.adapt.observe import (
-    MIN_SHARE,
-    TOTAL,
-    LabelImages,
-    RenderedLabels,
-    as_unit,
-    measure,
-    render_rgb,
-)
+from sagesplat.adapt.observe import MIN_SHARE, TOTAL, RenderedLabels, as_unit, measure, render_rgb
 from sagesplat.adapt.plan import Plan
+from sagesplat.core.events import Progress
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import ColumnTable, from_rows, read_columns
-from sagesplat.raster import Backend, Workspace
-from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
-from sagesplat.segment.valid import ALL_VALID, ValidPixels
+from sagesplat.raster import Workspace
+from sagesplat.run.job import Job
+from sagesplat.stages.method import Method
 
 NONE = -1  # level or count where there is none
 
@@ -59,42 +52,27 @@ def read_cross_view(path: Path) -> CrossView:
     return read_columns(path, CrossView, "delete it and run `sagesplat crossview` again")
 
 
-def cross_view(
-    scene: Scene,
-    photos: Photos,
-    ladder: Ladder,
-    targets: Sequence[float],
-    plan_for: Callable[[int, float], Plan],
-    *,
-    labels: LabelImages | None = None,
-    valid: ValidPixels = ALL_VALID,
-    backend: Backend = "auto",
-    antialiased: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> CrossView:
+def cross_view(job: Job, method: Method, targets: Sequence[float]) -> CrossView:
     """Plan each test view, compose, and measure per category, beside an oracle.
 
-    `plan_for` (row of Scene.views, target). `labels`: the pixels of each category (default: as the Gaussians
-    paint them, as nobody has masks of unseen views). `valid`: the pixels of photos that count.
-
     The oracle knows what every settled level measures in that view. Categories with less than
-    `MIN_SHARE` of the rendered pixels are planned but make no row. `progress` hears (images measured, images
-    in all).
+    `MIN_SHARE` of the rendered pixels are planned but make no row. The pixels of each category are as the
+    Gaussians paint them, unless the method knows better: nobody has masks of unseen views.
     """
     rows: list[dict[str, float]] = []
-    labels = labels or RenderedLabels(ladder.load(ladder.levels[-1]), backend, antialiased)
-    workspace = Workspace()
-    views = valid.rows(scene, scene.test_ids)
+    ladder, workspace = job.ladder, Workspace()
+    options: dict[str, Any] = {"backend": job.backend, "antialiased": job.antialiased}
+    labels = method.unseen_labels() or RenderedLabels(ladder.load(ladder.levels[-1]), **options)
+    views = job.valid.rows(job.scene, job.scene.test_ids)
     done, total = 0, len(views) * (len(ladder.levels) + len(targets))
 
     def measured(g: Gaussians, row: int) -> dict[int, dict[str, float]]:
         nonlocal done
-        view = scene.views[row]
-        image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
+        view = job.scene.views[row]
+        image = render_rgb(g, view.camera, workspace=workspace, **options)
         done += 1
-        if progress:
-            progress(done, total)
-        return measure(image, as_unit(photos[row]), labels[view], valid=valid[view])
+        job.emit(Progress("crossview", done, total))
+        return measure(image, as_unit(job.photos[row]), labels[view], valid=job.valid[view])
 
     at_level: dict[int, dict[int, dict[int, dict[str, float]]]] = {}
     for level in ladder.levels:  # one level in memory at a time
@@ -102,7 +80,7 @@ def cross_view(
         at_level[level] = {row: measured(g, row) for row in views}
     for row in views:
         for target in targets:
-            plan = plan_for(row, target)
+            plan = method.plan_view(row, target)
             composed = measured(plan.compose(ladder), row)
             levels = {level: views_of[row] for level, views_of in at_level.items()}
             rows += _rows(plan, composed, levels, ladder)

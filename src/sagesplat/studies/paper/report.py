@@ -21,8 +21,7 @@ from sagesplat.output.figures import STYLE, Colours
 from sagesplat.output.report import template
 from sagesplat.output.table import Table, markdown_text
 from sagesplat.output.tables import MB, by_size, last_counts, mean, name_of, promise_kept, view_mean
-from sagesplat.raster import Backend
-from sagesplat.scene.scene import Camera
+from sagesplat.run.job import Job
 from sagesplat.studies.paper.cross_view import NONE, CrossView
 from sagesplat.studies.paper.same_size import FULL, METHODS, SameSize
 
@@ -292,21 +291,14 @@ def cross_view_table(
     return Table("Cross-view: plans for unseen views", header, formats, body, notes=notes)
 
 
-def take_pictures(
-    photo: UInt8[np.ndarray, "H W 3"],
-    camera: Camera,
-    sets: Mapping[str, Gaussians],
-    metric: Lpips | None,
-    *,
-    backend: Backend = "auto",
-    antialiased: bool = False,
-) -> list[Picture]:
-    """The photo, and each set of Gaussians (by title) as the camera sees it."""
+def take_pictures(job: Job, row: int, sets: Mapping[str, Gaussians], metric: Lpips | None) -> list[Picture]:
+    """The photo of a view (row of Scene.views), and sets of Gaussians (by title) as its camera sees them."""
+    photo, camera = job.photos[row], job.scene.views[row].camera
     pictures = [Picture("photo", photo, np.nan, np.nan)]
     unit = as_unit(photo)
     of_photo = metric.features(unit) if metric else None
     for title, g in sets.items():
-        image = render_rgb(g, camera, backend=backend, antialiased=antialiased)
+        image = render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased)
         decibels = float(psnr(squared_error_map(image, unit).mean()))
         lpips = metric.distance(of_photo, metric.features(image)) if metric and of_photo else np.nan
         pictures.append(Picture(title, np.round(image * 255).astype(np.uint8), decibels, lpips))

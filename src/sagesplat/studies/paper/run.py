@@ -49,12 +49,7 @@ def cross_views(job: Job) -> None:
         )
 
     def make() -> list[str]:
-        table = cross_view(
-            job.scene, job.photos, job.ladder, targets, method.plan_view,
-            labels=method.unseen_labels(), valid=job.valid,
-            backend=job.backend, antialiased=job.antialiased,
-            progress=lambda done, total: job.emit(Progress("crossview", done, total)),
-        )  # fmt: skip
+        table = cross_view(job, method, targets)
         table.write_csv(run.cross_view)
         if scores := method.coverage(targets):
             kept = promises_table(scores, targets)
@@ -148,11 +143,10 @@ def equal_size(job: Job, config: PaperConfig) -> None:
         metrics = load_metrics(job.emit, config.lpips)
         rows: list[dict[str, float]] = []
         for of_view, plans, views in comparisons:
-            sets = contenders(job.scene, job.ladder, plans, tuned, antialiased=job.antialiased)
-            rows += compare(
-                job.scene, job.photos, views, sets, metrics, of_view=of_view, valid=job.valid,
-                backend=job.backend, antialiased=job.antialiased, progress=lambda *_: advance(1),
-            )  # fmt: skip
+            sets = contenders(job, plans, tuned)
+            for row in compare(job, views, sets, metrics, of_view):
+                rows.append(row)
+                advance(1)
         from_rows(SameSize, rows).write_csv(run.same_size)
         return [f"{len(rows)} images measured"]
 
@@ -239,8 +233,5 @@ def _panels(job: Job, config: PaperConfig, view: int) -> dict[str, list[Picture]
     for row in dict.fromkeys(rows):
         sets = {f"3DGS, {len(full):,}": full}
         sets |= {f"t={p.target:g}, {p.count:,}": p.compose(job.ladder) for p in _view_plans(job, row)}
-        panels[job.scene.views[row].name] = take_pictures(
-            job.photos[row], job.scene.views[row].camera, sets, metric,
-            backend=job.backend, antialiased=job.antialiased,
-        )  # fmt: skip
+        panels[job.scene.views[row].name] = take_pictures(job, row, sets, metric)
     return panels

@@ -1,6 +1,6 @@
 """Quality at equal model size (Table IV of the paper): compositions against 3DGS of the same size."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -16,10 +16,8 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.columns import ColumnTable, read_columns
 from sagesplat.metrics.image import pasted
 from sagesplat.metrics.lpips import Lpips
-from sagesplat.raster import Backend, Workspace
-from sagesplat.scene.images import Photos
-from sagesplat.scene.scene import Scene
-from sagesplat.segment.valid import ALL_VALID, ValidPixels
+from sagesplat.raster import Workspace
+from sagesplat.run.job import Job
 from sagesplat.studies.lpips import features_of
 from sagesplat.train.importance import importance
 
@@ -67,19 +65,13 @@ def nearest_snapshot(ladder: Ladder, count: int) -> int:
     return min(not_recovering, key=lambda level: (abs(ladder.size(level) - count), -level))
 
 
-def contenders(
-    scene: Scene,
-    ladder: Ladder,
-    plans: Sequence[Plan],
-    tuned: Callable[[Gaussians], Gaussians],
-    *,
-    antialiased: bool = False,
-) -> list[Contender]:
+def contenders(job: Job, plans: Sequence[Plan], tuned: Callable[[Gaussians], Gaussians]) -> list[Contender]:
     """For each plan: its composition, the same tuned, 3DGS's snapshot nearest in size, 3DGS pruned to it and
     tuned; last the full model of 3DGS.
     """
+    ladder, scene = job.ladder, job.scene
     full = ladder.load(ladder.levels[-1])
-    weights = importance(full, scene, scene.train_ids.tolist(), antialiased=antialiased)
+    weights = importance(full, scene, scene.train_ids.tolist(), antialiased=job.antialiased)
     found = []
     for plan in plans:
         composed = plan.compose(ladder)
@@ -94,39 +86,26 @@ def contenders(
 
 
 def compare(
-    scene: Scene,
-    photos: Photos,
-    views: Sequence[int],
-    sets: Sequence[Contender],
-    metrics: Mapping[str, Lpips],
-    *,
-    of_view: int = -1,
-    valid: ValidPixels = ALL_VALID,
-    backend: Backend = "auto",
-    antialiased: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[dict[str, float]]:
+    job: Job, views: Sequence[int], sets: Sequence[Contender], metrics: Mapping[str, Lpips], of_view: int
+) -> Iterator[dict[str, float]]:
     """Rows of `SameSize`: every contender in every view (rows of Scene.views).
 
-    `metrics`: LPIPS by column name. `valid`: the pixels that count; at others LPIPS sees the image itself.
-    `progress` hears (images measured, images in all).
+    `metrics`: LPIPS by column name; at pixels that do not count it sees the image itself.
     """
-    rows: list[dict[str, float]] = []
     workspace = Workspace()
     for row in views:
-        photo, view = as_unit(photos[row]), scene.views[row]
-        of_photo = features_of(metrics, photo)
+        photo, view = as_unit(job.photos[row]), job.scene.views[row]
+        valid, of_photo = job.valid[view], features_of(metrics, photo)
         for target, method, g in sets:
-            image = render_rgb(g, view.camera, backend=backend, antialiased=antialiased, workspace=workspace)
-            found = measure_total(image, photo, valid[view])
-            if valid[view] is not None:
-                of_photo = features_of(metrics, pasted(photo, image, valid[view]))
+            image = render_rgb(
+                g, view.camera, backend=job.backend, antialiased=job.antialiased, workspace=workspace
+            )
+            found = measure_total(image, photo, valid)
+            if valid is not None:
+                of_photo = features_of(metrics, pasted(photo, image, valid))
             lpips = {n: metric.distance(metric.features(image), of_photo[n]) for n, metric in metrics.items()}
-            rows.append({
+            yield {
                 "of_view": of_view, "target": target, "method": method, "view": row, "count": len(g),
                 "ssim": found["ssim"], "psnr": found["psnr"],
                 "lpips_alex": np.nan, "lpips_vgg": np.nan, **lpips,
-            })  # fmt: skip
-            if progress:
-                progress(len(rows), len(views) * len(sets))
-    return rows
+            }  # fmt: skip

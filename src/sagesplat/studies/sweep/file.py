@@ -1,5 +1,6 @@
 """The file of a sweep: scenes, variants of the settings, seeds and targets."""
 
+import os
 import re
 from collections import Counter
 from collections.abc import Mapping
@@ -70,7 +71,7 @@ def read_sweep(path: Path) -> Sweep:
     for scene, to in file.scenes.items():
         capture = None if to == BUILT_IN else folder / to
         _need(
-            not capture or _is_folder(capture),
+            not capture or os.path.isdir(capture),  # false for a name that no disk has, e.g. too long
             f"{path}: scenes.{scene}: no folder {short(capture)}; mend the path",
         )
         for variant, changes in (file.variants or {"": {}}).items():
@@ -83,13 +84,6 @@ def read_sweep(path: Path) -> Sweep:
     for name, times in Counter(names).items():
         _need(times == 1, f"{path}: two runs would be called {name}; rename a scene or a variant")
     return tuple(cells)
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:  # a name that no disk has, e.g. too long
-        return False
 
 
 def _need(fine: object, message: str) -> None:

@@ -8,15 +8,14 @@ import numpy as np
 
 from sagesplat.adapt.eq1 import plan_view
 from sagesplat.adapt.plan import check_target
-from sagesplat.core.errors import RunError, SageError
-from sagesplat.core.events import Warned
-from sagesplat.metrics.lpips import load_lpips
+from sagesplat.core.errors import RunError
 from sagesplat.output.figures import save_figure
 from sagesplat.output.table import Table
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.stages.results import models_of
 from sagesplat.stages.shared import observed
+from sagesplat.studies.lpips import load_metrics
 from sagesplat.studies.paper.report import Picture, panel, take_pictures
 from sagesplat.studies.transfer import score
 from sagesplat.studies.transfer.report import headline, summary_table, transfer_figure, transfer_table
@@ -63,21 +62,14 @@ def _pictures(
     row = int(rows[len(rows) // 2])
     seen = job.distances(job.fit_config.distance)
     here = {label: float(d[row]) for label, d in seen.items()}
-    try:
-        metric = load_lpips("alex", lpips)
-    except SageError as error:
-        metric = None
-        job.emit(Warned(f"no LPIPS: {error}"))
+    metric = load_metrics(job.emit, lpips, ["alex"]).get("lpips_alex")
     full = job.ladder.load(job.ladder.levels[-1])
     sets = {f"3DGS, {len(full):,}": full}
     for target in sorted(targets):
         own = plan_view(b.models, b.counts, here, target, row, recovering=b.recovering).levels
         g = job.ladder.compose(own | score.transferred_levels(a, b, row, here, target, "extent"))
         sets[f"t={target:g}, {len(g):,}"] = g
-    return take_pictures(
-        job.photos[row], job.scene.views[row].camera, sets, metric,
-        backend=job.backend, antialiased=job.antialiased,
-    )  # fmt: skip
+    return take_pictures(job, row, sets, metric)
 
 
 def load_fitted(job: Job) -> FittedRun:

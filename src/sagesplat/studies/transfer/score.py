@@ -14,6 +14,7 @@ from sagesplat.adapt.plan import Counts, Models
 from sagesplat.core.errors import RunError
 from sagesplat.core.geometry import mean_neighbour_distance
 from sagesplat.io.columns import ColumnTable
+from sagesplat.output.tables import mean
 from sagesplat.segment.masks import UNLABELLED_NAME
 
 NORMALISATIONS = ("raw", "extent", "footprint")
@@ -148,9 +149,8 @@ def transfer(a: FittedRun, b: FittedRun, targets: Sequence[float]) -> Transfer:
             for split, ids in (("train", b.train_views), ("test", b.test_views)):
                 here = np.isin(views, ids)
                 error = (predicted - measured)[:, here]
-                error = error[np.isfinite(error)]
-                quality = {"ssim_error": _mean(np.abs(error)), "bias": _mean(error)}
-                quality |= {"views": int(here.sum()), "outside": _mean(outside[:, here])}
+                quality = {"ssim_error": mean(np.abs(error)), "bias": mean(error)}
+                quality |= {"views": int(here.sum()), "outside": mean(outside[:, here])}
                 for target in targets:
                     key = {"split": split, "target": target, "category": shared.name, "predictor": predictor}
                     chosen = score(predicted[:, here], measured[:, here], levels, counts, target)
@@ -189,12 +189,8 @@ def score(
     hit, reachable = reached[chosen, np.arange(len(chosen))], reached.any(0)
     return {
         "reachable": int(reachable.sum()),
-        "iteration_error": _mean(np.abs(levels[chosen] - levels[best])[reachable]),
-        "hit": _mean(hit[reachable]),
+        "iteration_error": mean(np.abs(levels[chosen] - levels[best])[reachable]),
+        "hit": mean(hit[reachable]),
         "missed": int((reachable & ~hit).sum()),
-        "regret": _mean((counts[chosen] - counts[best])[hit]),
+        "regret": mean((counts[chosen] - counts[best])[hit]),
     }
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean(dtype=np.float64)) if values.size else np.nan
