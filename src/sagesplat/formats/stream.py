@@ -277,6 +277,14 @@ def starts_of_streams(content: bytes, *, name: str = "streams") -> list[int]:
     return starts
 
 
+def end_of_palette(content: bytes, *, name: str = "streams") -> int:
+    """Where the palette ends that a file of streams begins with, 0 without one; DataError for damage."""
+    try:
+        return palette_end(content)
+    except ValueError as error:
+        raise _damaged(name, error) from None
+
+
 def palette_of(content: bytes, *, name: str = "streams") -> Palette | None:
     """The palette that a file of streams begins with, if there is one; DataError for damage."""
     try:

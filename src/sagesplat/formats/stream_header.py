@@ -48,10 +48,10 @@ class Precision:
     colour: float = 2.0  # steps of sh0, of SPZ's units (of a byte)
     log_scale: float = 1 / 8  # steps
     sh_bits: tuple[int, int] = (5, 4)  # steps of 2^(1 - bits): of degree 1, and of 2 and 3
-    sh_range: float = 1.0  # harmonics beyond are cut, as in training
     rotation: float = -0.75  # classes finer than usual; two halve the steps
     least: float = 0.75  # opacity, in its steps: what never has more is left out
     grid: "Grid | None" = None  # instead of `position` and `rotation`: that of streams which were decoded
+    sh_range: float = 1.0  # harmonics beyond are cut, as in training
 
     def __post_init__(self) -> None:
         steps = (self.position, self.colour, self.log_scale)
