@@ -1,7 +1,7 @@
 """Bytes of splats as they came in, as coded streams and as splat-transform's SOG, at what they look like.
 
 All Gaussians are one stream. The steps are chosen as `adopt` chooses them, from viewpoints that the
-comparison does not use. A SOG that is there already is taken: the palette of many Gaussians takes a CPU hours.
+comparison does not use. A SOG that is there already is taken: a palette of many Gaussians takes CPUs hours.
 """
 
 from collections.abc import Sequence
