@@ -362,7 +362,7 @@ def test_frequent_rows_come_first():
     palette = palette_for(g, AS_GIVEN[1])
     assert palette is not None
     assert palette.entries(palette.rows[[1, 0]]).tolist() == [1, 0]
-    assert palette.entries(harmonics_of(turned_round(g).shN, (7, 6), 256.0))[:6].tolist() == [
+    assert palette.entries(harmonics_of(turned_round(g).shN, AS_GIVEN[1].sh_bits, 256.0))[:6].tolist() == [
         1,
         0,
         0,
@@ -383,7 +383,7 @@ def test_a_stream_needs_the_palette_of_its_file():
     for wrong, words in (
         (None, "no palette"),
         (other, "of other harmonics"),
-        (Palette(2, (7, 6), palette.rows[:2]), "row 4 of a palette of 2"),
+        (Palette(2, AS_GIVEN[1].sh_bits, palette.rows[:2]), "row 4 of a palette of 2"),
     ):
         with pytest.raises(DataError, match=words):
             decode_stream(content, palette=wrong)

@@ -68,14 +68,14 @@ class Precision:
 # of Gaussians as they came in, ascending; harmonics need more bits where a picture shows them
 AS_GIVEN = (
     Precision(position=1 / 12, opacity=3, log_scale=1 / 16, rotation=2.0, sh_range=_SH_RANGE),
-    Precision(position=1 / 16, opacity=3, log_scale=1 / 12, rotation=0.0, sh_bits=(7, 6), sh_range=_SH_RANGE),
+    Precision(position=1 / 16, opacity=3, log_scale=1 / 12, rotation=0.5, sh_bits=(6, 6), sh_range=_SH_RANGE),
     Precision(
         position=1 / 16, opacity=2, log_scale=1 / 16, rotation=1.0, sh_bits=(7, 7), sh_range=_SH_RANGE,
         least=0.5,
     ),
     Precision(
-        position=1 / 32, opacity=2, colour=1.0, log_scale=1 / 32, sh_bits=(8, 8), sh_range=_SH_RANGE,
-        rotation=4.0, least=0.5,
+        position=1 / 32, opacity=1, colour=1.0, log_scale=1 / 32, sh_bits=(8, 8), sh_range=_SH_RANGE,
+        rotation=3.0, least=0.5,
     ),
 )  # fmt: skip
 

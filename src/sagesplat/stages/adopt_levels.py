@@ -206,7 +206,8 @@ def _write(
     if not lossless and (other := sum(one.format != "stream" for one in made.increments)):
         job.emit(Warned(f"{other} files are PLY: some of their Gaussians lie too far off to be rounded"))
     write_cells(run.cells, describe_cells(sent, dict(label_of)))
-    size, files = sum(one.nbytes for one in made.increments), len({one.uri for one in made.increments})
+    uris = {one.uri for one in made.increments}  # with palettes, which are in no increment
+    size, files = sum((run.increments / uri).stat().st_size for uri in uris), len(uris)
     if ssim < KEPT and not lossless:
         job.emit(
             Warned(f"rounding costs {1 - ssim:.4f} of SSIM; --lossless keeps the last level as it came in")
