@@ -5,6 +5,7 @@ many Gaussians there are up to it, and what they are decoded to, in right, up, b
 (w x y z), log_scales, opacities, sh0 and shN (coefficient by coefficient, red, green, blue). With two
 opacities `opacities` are the first ones, `seconds` the second ones, `weights` those of the second ones at
 each level in 1/255, and `levels` the opacities of all Gaussians up to each level where it is the newest one.
+`palette` has the bytes of the palette that a stream needs.
 """
 
 import base64
@@ -19,10 +20,12 @@ import torch
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.stream import decode_stream, encode_stream
-from sagesplat.formats.stream_header import Precision, turned_round
+from sagesplat.formats.stream_header import Precision, harmonics_of, turned_round
+from sagesplat.formats.stream_palette import Palette
 
 DATA = Path(__file__).parent / "data" / "streams.json"
 OLD = Precision(1 / 8, 6, rotation=0.0, least=0.5)
+GIVEN = replace(OLD, sh_bits=(7, 6), sh_range=4.0)
 Case = dict[str, Any]
 
 
@@ -55,6 +58,12 @@ def far_off(count: int) -> Gaussians:
     return g
 
 
+def few_rows(count: int, degree: int) -> Gaussians:
+    """Waves with five different rows of harmonics, of which one is beyond 1."""
+    g = waves(count, degree)
+    return replace(g, shN=3 * g.shN[:5][torch.arange(count) ** 2 % 7 % 5])
+
+
 def cases() -> list[Case]:
     """All cases of streams.json."""
     return [
@@ -69,16 +78,25 @@ def cases() -> list[Case]:
         case(
             "two opacities, empty levels", waves(40, 0), [0, 20, 20, 40, 40], Precision(), (0, 0, 0.3, 0.7, 1)
         ),
+        case("a palette, degree 2", few_rows(60, 2), [5, 5, 60], GIVEN, palette=True),
+        case("a palette, two opacities", few_rows(40, 3), [9, 40], GIVEN, (0.0, 0.4), palette=True),
     ]
 
 
 def case(
-    name: str, g: Gaussians, sizes: list[int], precision: Precision = OLD, weights: tuple[float, ...] = ()
+    name: str,
+    g: Gaussians,
+    sizes: list[int],
+    precision: Precision = OLD,
+    weights: tuple[float, ...] = (),
+    *,
+    palette: bool = False,
 ) -> Case:
     """A stream and what it decodes to."""
     second = SecondOpacities(g.logit_opacities.flip(0) - 1, {-1: weights}) if weights else None
-    coded = encode_stream(g, sizes, second=second, precision=precision)
-    decoded = decode_stream(coded.content)
+    rows = palette_of(g, precision) if palette else None
+    coded = encode_stream(g, sizes, second=second, precision=precision, palette=rows)
+    decoded = decode_stream(coded.content, palette=rows)
     found = turned_round(decoded.gaussians)
     values = {name: value for name, value in found.parameters().items() if name != "logit_opacities"}
     values["opacities"] = torch.sigmoid(found.logit_opacities.double())
@@ -89,12 +107,21 @@ def case(
         "sizes": coded.sizes,
         "gaussians": {name: _plain(value) for name, value in values.items()},
     }
+    if rows:
+        made["palette"] = base64.b64encode(rows.encoded()).decode()
     if decoded.second:
         made["weights"] = [round(255 * weight) for weight in coded.weights]
         made["gaussians"]["seconds"] = _plain(torch.sigmoid(decoded.second.logits.double()))
-        newest = [decode_stream(coded.content, k).shown().logit_opacities for k in range(1, 1 + len(sizes))]
+        levels = [decode_stream(coded.content, k, palette=rows) for k in range(1, 1 + len(sizes))]
+        newest = [one.shown().logit_opacities for one in levels]
         made["levels"] = [_plain(torch.sigmoid(logits.double())) for logits in newest]
     return made
+
+
+def palette_of(g: Gaussians, precision: Precision) -> Palette:
+    """All rows of harmonics of Gaussians."""
+    harmonics = harmonics_of(turned_round(g).shN, precision.sh_bits, precision.sh_range)
+    return Palette(g.sh_degree, precision.sh_bits, np.unique(harmonics, axis=0))
 
 
 def _plain(values: torch.Tensor) -> list[float]:

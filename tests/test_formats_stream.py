@@ -17,8 +17,9 @@ from make_stream_vectors import DATA, Case, cases
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import PARAMETERS, Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
-from sagesplat.formats.stream import MAX_COUNT, decode_stream, encode_stream, starts_of_streams
-from sagesplat.formats.stream_header import SIZE, Precision
+from sagesplat.formats.stream import MAX_COUNT, decode_stream, encode_stream, palette_of, starts_of_streams
+from sagesplat.formats.stream_header import AS_GIVEN, SIZE, Precision, harmonics_of, turned_round
+from sagesplat.formats.stream_palette import Palette, read_palette
 from tests.conftest import random_gaussians
 from tests.fuzz.mutate import BYTES
 
@@ -201,6 +202,7 @@ def test_a_trained_model_needs_few_bytes():
 def test_golden_streams_stay_byte_for_byte(case: Case):
     stored = {one["name"]: one for one in json.loads(DATA.read_text(encoding="utf-8"))}[case["name"]]
     assert case["content"] == stored["content"]
+    assert case.get("palette") == stored.get("palette")
     assert [list(case["ends"]), list(case["sizes"])] == [stored["ends"], stored["sizes"]]
     for name, values in stored["gaussians"].items():
         np.testing.assert_allclose(case["gaussians"][name], values, atol=1e-6)
@@ -258,7 +260,8 @@ def test_a_precision_that_the_format_does_not_have(wrong: dict[str, Any]):
     [
         (0, b"X", "not a sagesplat-stream"),
         (4, b"\2", "a stream of version 2, and not 3; use the version of sagesplat that wrote it"),
-        (5, b"\4", "unknown flags 4"),
+        (5, b"\x08", "unknown flags 8"),
+        (5, b"\4", "no palette"),
         (7, b"\0", "0 levels"),
         (24, b"\0\0\xc0\x7f", "impossible steps"),
         (12, b"\0\0\x80\x7f", "impossible steps"),
@@ -317,3 +320,98 @@ def test_what_was_decoded_is_encoded_without_further_loss():
 def test_levels_that_a_stream_does_not_have(level: int):
     with pytest.raises(DataError, match="of 3"):
         decode_stream(encode_stream(visible(9), [1, 2, 9]).content, level)
+
+
+def few_rows(count: int, rows: int, degree: int = 2) -> Gaussians:
+    """Gaussians with so many different rows of harmonics, some of them beyond 1."""
+    g = visible(count, degree=degree)
+    return replace(g, shN=6 * g.shN[:rows][torch.arange(count) % rows])
+
+
+def palette_for(g: Gaussians, precision: Precision) -> Palette | None:
+    harmonics = harmonics_of(turned_round(g).shN, precision.sh_bits, precision.sh_range)
+    return Palette.of(harmonics, precision.sh_bits)
+
+
+def test_few_rows_of_harmonics_are_a_palette_which_is_smaller_and_says_the_same():
+    g = few_rows(3000, 100)
+    precision = AS_GIVEN[1]
+    palette = palette_for(g, precision)
+    assert palette is not None
+    assert len(palette.rows) == 100
+    alone = encode_stream(g, [9, 9, 3000], precision=precision)
+    coded = encode_stream(g, [9, 9, 3000], precision=precision, palette=palette)
+    found = decode_stream(coded.content, palette=read_palette(palette.encoded()))
+    for key, value in decode_stream(alone.content).gaussians.parameters().items():
+        assert torch.equal(found.gaussians.parameters()[key], value), key
+    assert float(found.gaussians.shN.abs().max()) > 1.5
+    assert len(coded.content) + len(palette.encoded()) < 0.6 * len(alone.content)
+    first = decode_stream(coded.content[: coded.ends[0]], palette=palette)
+    assert torch.equal(first.gaussians.shN, found.gaussians.shN[:9])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_harmonics_that_hardly_repeat_are_coded_one_by_one(degree: int):
+    assert palette_for(visible(300, degree=degree), AS_GIVEN[1]) is None
+    assert palette_for(visible(0, degree=degree), AS_GIVEN[1]) is None
+
+
+def test_frequent_rows_come_first():
+    g = few_rows(400, 2, degree=1)
+    g = replace(g, shN=torch.where((torch.arange(400) % 5 == 0)[:, None, None], g.shN[:1], g.shN[1:2]))
+    palette = palette_for(g, AS_GIVEN[1])
+    assert palette is not None
+    assert palette.entries(palette.rows[[1, 0]]).tolist() == [1, 0]
+    assert palette.entries(harmonics_of(turned_round(g).shN, AS_GIVEN[1].sh_bits, 256.0))[:6].tolist() == [
+        1,
+        0,
+        0,
+        0,
+        0,
+        1,
+    ]
+    with pytest.raises(ValueError, match="not in the palette"):
+        palette.entries(palette.rows + 1)
+
+
+def test_a_stream_needs_the_palette_of_its_file():
+    g = few_rows(60, 5)
+    palette = palette_for(g, AS_GIVEN[1])
+    assert palette is not None
+    content = encode_stream(g, [60], precision=AS_GIVEN[1], palette=palette).content
+    other = Palette(2, (5, 4), palette.rows)
+    for wrong, words in (
+        (None, "no palette"),
+        (other, "of other harmonics"),
+        (Palette(2, AS_GIVEN[1].sh_bits, palette.rows[:2]), "row 4 of a palette of 2"),
+    ):
+        with pytest.raises(DataError, match=words):
+            decode_stream(content, palette=wrong)
+    with pytest.raises(ValueError, match="of other harmonics"):
+        encode_stream(g, [60], palette=palette)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (4, 2, "version 2"),
+        (5, 0, "degree 0"),
+        (5, 4, "degree 4"),
+        (6, 9, "steps 9"),
+        (8, 0, "0 rows"),
+        (10, 2, "a palette of 131"),
+        (14, 1, "cut off"),
+        (8, 4, "damaged"),
+        (20, 255, "damaged"),
+    ],
+)
+def test_damaged_palettes(at: int, value: int, words: str):
+    palette = palette_for(few_rows(60, 5), AS_GIVEN[1])
+    assert palette is not None
+    content = bytearray(palette.encoded())
+    content[at] = value
+    with pytest.raises(DataError, match=words):
+        palette_of(bytes(content), name="x.sgst")
+    with pytest.raises(DataError, match="cut off"):
+        palette_of(palette.encoded()[:-1])
+    assert palette_of(b"") is None

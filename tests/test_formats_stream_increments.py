@@ -15,6 +15,7 @@ from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.second_opacity import SecondOpacities, blended
 from sagesplat.formats.increments import Increment, full_scene, read_increments, read_index, shown, totals
+from sagesplat.formats.stream import palette_of, starts_of_streams
 from sagesplat.formats.stream_header import AS_GIVEN
 from sagesplat.formats.stream_increments import Streams, read_streams, write_streams
 from sagesplat.io.typed import convert_as
@@ -276,6 +277,32 @@ def test_the_last_set_is_kept_as_finely_as_asked(tmp_path):
         mine = torch.from_numpy(made.rows[(made.rows >= 26) & (made.rows < 35)])
         off.append(float((top.shN - g.shN[mine]).abs().mean()))
     assert off[1] < off[0] / 2
+
+
+def test_cells_share_the_palette_of_their_file(tmp_path):
+    g = random_gaussians(2000, degree=1, logit=2)
+    g = replace(g, shN=g.shN[torch.arange(2000) % 90], label_ids=(torch.arange(2000) % 2).short())
+    sizes, labels = {0: (40, 400, 1000), 1: (40, 400, 1000)}, {0: 7, 1: 7}
+    more: dict[str, Any] = {"label_of": labels, "replaces": {0: (2,), 1: (2,)}, "last": AS_GIVEN[1]}
+    made = write_streams(tmp_path, g, sizes, {}, **more)
+    (uri,) = {one.uri for one in made.increments}
+    content = (tmp_path / uri).read_bytes()
+    palette, starts = palette_of(content), starts_of_streams(content)
+    assert palette is not None
+    assert len(palette.rows) == 90
+    assert starts == sorted(one.offset for one in made.increments if one.level < 3)
+    assert starts[0] == len(palette.encoded())  # no increment has it
+    assert sum(one.nbytes for one in made.increments) == len(content) - starts[0]
+    for cell in (0, 1):
+        found = read_increments(tmp_path, shown(made.increments, cell, 3))
+        kept = torch.from_numpy(made.rows[made.rows % 2 == cell])
+        wanted = g.shN[kept[(kept >= 80)]]
+        assert len(found) == len(wanted)
+        assert (found.shN - wanted).abs().max() <= 1 / 64
+    own = g.select(torch.arange(2000))
+    own.shN.copy_(random_gaussians(2000, degree=1).shN)
+    write_streams(tmp_path, own, sizes, {}, **more)
+    assert palette_of((tmp_path / read_index(tmp_path)[0].uri).read_bytes()) is None
 
 
 def test_what_lies_far_off_makes_files_of_a_set(tmp_path):

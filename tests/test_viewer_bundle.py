@@ -35,6 +35,7 @@ from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.increments import write_increments
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
+from sagesplat.formats.stream_header import AS_GIVEN
 from sagesplat.formats.stream_increments import write_streams
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import frames, promises
@@ -463,6 +464,31 @@ def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewe
     assert len(list((tmp_path / "out" / "chunks").iterdir())) == 3
     assert len(packed_parts(tmp_path / "out")) == len(listed)
     assert written.chunks == manifest["totals"]["bytes"]
+
+
+def test_a_palette_is_the_first_range_of_its_file(tmp_path, contents, viewer) -> None:
+    g = random_gaussians(900, degree=1, logit=3)
+    cells = torch.from_numpy(np.resize(G.label_ids.numpy(), 900)).sort().values
+    g = replace(g, shN=g.shN[torch.arange(900) % 7], label_ids=cells)
+    counts = {cell: int((cells == cell).sum()) for cell in SIZES}
+    made = write_streams(
+        tmp_path / "chunks", g, {i: (1, n // 3, n) for i, n in counts.items()}, NAMES, label_of=LABEL_OF,
+        replaces=dict.fromkeys(counts, (2,)), last=AS_GIVEN[1],
+    )  # fmt: skip
+    write_bundle(tmp_path / "out", replace(contents, chunks=made.increments), viewer)
+    for label in manifest_of(tmp_path / "out")["labels"]:
+        palette, levels = label["palette"], [one for cell in label["cells"] for one in cell["levels"]]
+        content = (tmp_path / "out" / palette["uri"]).read_bytes()
+        assert {one["uri"] for one in levels} == {palette["uri"]}
+        assert (palette["offset"], palette["bytes"]) == (0, min(one["offset"] for one in levels))
+        assert hashlib.sha256(content[: palette["bytes"]]).hexdigest() == palette["sha256"]
+        assert palette["bytes"] + sum(one["bytes"] for one in levels) == len(content)
+    uri = made.increments[0].uri
+    damaged = bytearray((tmp_path / "chunks" / uri).read_bytes())
+    damaged[20] ^= 1
+    (tmp_path / "chunks" / uri).write_bytes(damaged)
+    with pytest.raises(DataError, match="not the chunk that was written"):
+        write_bundle(tmp_path / "other", replace(contents, chunks=made.increments), viewer)
 
 
 def order_at_origin(*ladders: Ladder, behind: Sequence[int] = ()) -> list[tuple[int, int]]:

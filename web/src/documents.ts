@@ -4,10 +4,10 @@ export type Vec3 = [number, number, number];
 export type Whole = number;
 /** A SHA-256 in hexadecimal. */
 export type Sha256 = string;
-/** Smallest x y z, largest x y z. */
-export type Box = [number, number, number, number, number, number];
 /** A path below the bundle's folder. */
 export type Path = string;
+/** Smallest x y z, largest x y z. */
+export type Box = [number, number, number, number, number, number];
 /** A range of a coded stream, of which a cell has one, and a file those of a label; or SPZ version 3; or a binary PLY in INRIA's layout, its y and z opposite to the bundle's. */
 export type Format = "stream" | "spz" | "ply";
 /** Whether a bound holds at its confidence, or calibration views were too few for that. */
@@ -90,11 +90,19 @@ export interface Label {
   always: boolean;
   /** Not shown to begin with. */
   hidden?: true;
+  palette?: Palette;
   cells: Cell[];
   quality: {
     fidelity?: LabelQuality;
     ssim?: LabelQuality;
   };
+}
+/** What the streams of a label's highest levels, from the last that replaces on, take their harmonics from: the first bytes of their file. */
+export interface Palette {
+  uri: Path;
+  offset: 0;
+  bytes: Whole;
+  sha256: Sha256;
 }
 /** A compact part of a label, with levels of its own. */
 export interface Cell {

@@ -68,6 +68,7 @@ export interface Renderer {
    * Decodes an increment of a cell, which is drawn after `swap` shows it. Rejects for an invalid file.
    *
    * @param below - of a stream, the increments below it
+   * @param palette - of its file, if it needs one
    */
   decode(
     label: number,
@@ -76,6 +77,7 @@ export interface Renderer {
     bytes: Uint8Array,
     format: Format,
     below?: readonly Uint8Array[],
+    palette?: { readonly sha256: string; readonly bytes: Uint8Array },
   ): Promise<Handle>;
   /** Shows some increments and hides others in one tick; hidden ones stay drawn until the next sort is done. */
   swap(show: readonly Handle[], hide: readonly Handle[]): void;

@@ -1,13 +1,16 @@
 /** How fast coded streams are decoded to what the GPU reads. */
 
 import { HEADER_BYTES, readHeader } from "../src/core/header";
+import { Palette } from "../src/core/palette";
 import { StreamDecoder } from "../src/core/stream";
 import { Packing } from "../src/view/packing";
+import { endOfPalette } from "./fuzz";
 
-/** The streams of a file, which lie one after the other. */
-export function streamsOf(file: Uint8Array): Uint8Array[] {
-  const found: Uint8Array[] = [];
-  let at = 0;
+/** The streams of a file, which lie one after the other, and the palette before them. */
+export function streamsOf(file: Uint8Array): { palette: Palette | null; stream: Uint8Array }[] {
+  const found: { palette: Palette | null; stream: Uint8Array }[] = [];
+  let at = endOfPalette(file);
+  const palette = at ? new Palette(file.subarray(0, at)) : null;
   const number = () => {
     let value = 0;
     for (let shift = 0; ; shift += 7) {
@@ -25,21 +28,20 @@ export function streamsOf(file: Uint8Array): Uint8Array[] {
       const size = number(); // before `at` is read: it moves
       at += Number(twoOpacities) + size;
     }
-    found.push(file.subarray(start, at));
+    found.push({ palette, stream: file.subarray(start, at) });
   }
   return found;
 }
 
 /** Millions of Gaussians a second: of the first round, the best one and the median. */
 export function decodeSpeed(files: readonly Uint8Array[], rounds: number): Record<string, number> {
-  const streams = files.flatMap(streamsOf);
   const times: number[] = [];
   let count = 0;
   for (let round = 0; round < rounds; round++) {
     const begun = performance.now();
     count = 0;
-    for (const stream of streams) {
-      for (const part of new StreamDecoder(new Packing()).push(stream)) count += part.count;
+    for (const { palette, stream } of files.flatMap(streamsOf)) {
+      for (const part of new StreamDecoder(new Packing(), palette).push(stream)) count += part.count;
     }
     times.push(performance.now() - begun);
   }

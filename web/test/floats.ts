@@ -1,7 +1,8 @@
 /** Decodes coded streams to the numbers that docs/formats.md says, for comparison. */
 
-import { BASES, type Block, ROTATIONS } from "../src/core/columns";
+import { BASES, type Block, type Harmonics, ROTATIONS } from "../src/core/columns";
 import type { Header } from "../src/core/header";
+import type { Palette } from "../src/core/palette";
 import type { Sink } from "../src/core/stream";
 
 /** The Gaussians of a level, in right, up, back. */
@@ -20,9 +21,12 @@ export interface Gaussians {
 /** A level is decoded to floats. */
 export class Floats implements Sink<Gaussians> {
   private header: Header | null = null;
+  private rows: Float32Array | null = null; // [rows, K, 3] of the palette
 
-  begin(header: Header, count: number, deferred: number): Gaussians {
+  begin(header: Header, count: number, deferred: number, palette: Palette | null): Gaussians {
     this.header = header;
+    this.rows = palette && new Float32Array(3 * palette.count * (BASES[header.degree] as number));
+    palette?.decode((harmonics, start) => this.putHarmonics(this.rows as Float32Array, harmonics, start));
     const floats = (each: number) => new Float32Array(each * count);
     return {
       count,
@@ -67,12 +71,32 @@ export class Floats implements Sink<Gaussians> {
       }
       level.quats[4 * row] = Math.sqrt(Math.max(0, square));
     }
-    block.harmonics.forEach(({ found, rows, places, red, green, blue }, band) => {
-      const unit = 2 ** (1 - header.shBits[band ? 1 : 0]);
+    if (this.rows) this.putRows(level.shN, this.rows, block.entries, start, count);
+    else this.putHarmonics(level.shN, block.harmonics, start);
+  }
+
+  private putRows(
+    out: Float32Array,
+    rows: Float32Array,
+    entries: Int32Array,
+    start: number,
+    count: number,
+  ): void {
+    const each = 3 * (BASES[(this.header as Header).degree] as number);
+    for (let i = 0; i < count; i++) {
+      const entry = entries[i] as number;
+      out.set(rows.subarray(each * entry, each * (entry + 1)), each * (start + i));
+    }
+  }
+
+  private putHarmonics(out: Float32Array, harmonics: readonly Harmonics[], start: number): void {
+    const { shBits, degree } = this.header as Header;
+    harmonics.forEach(({ found, rows, places, red, green, blue }, band) => {
+      const unit = 2 ** (1 - shBits[band ? 1 : 0]);
       for (let i = 0; i < found; i++) {
-        const basis = (BASES[band] as number) + at(places, i);
-        const first = 3 * ((start + at(rows, i)) * (BASES[header.degree] as number) + basis);
-        level.shN.set([unit * at(red, i), unit * at(green, i), unit * at(blue, i)], first);
+        const basis = (BASES[band] as number) + (places[i] as number);
+        const first = 3 * ((start + (rows[i] as number)) * (BASES[degree] as number) + basis);
+        out.set([unit * (red[i] as number), unit * (green[i] as number), unit * (blue[i] as number)], first);
       }
     });
   }

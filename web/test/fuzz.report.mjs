@@ -12,7 +12,10 @@ const root = fileURLToPath(new URL("..", import.meta.url));
 const { module } = await runnerImport(join(root, "test/fuzz.ts"), { root, configFile: false });
 
 const golden = JSON.parse(readFileSync(join(root, "../tests/data/streams.json"), "utf8"));
-const streams = golden.map(({ content }) => new Uint8Array(Buffer.from(content, "base64")));
+const bytes = (text) => new Uint8Array(Buffer.from(text, "base64"));
+const streams = golden.map(({ content, palette = "" }) =>
+  Uint8Array.of(...bytes(palette), ...bytes(content)),
+);
 for (const name of folder ? readdirSync(folder) : []) {
   if (name.endsWith(".sgst")) streams.push(new Uint8Array(readFileSync(join(folder, name))));
 }

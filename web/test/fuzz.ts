@@ -1,5 +1,6 @@
 /** Damages coded streams and decodes them as the viewer does. */
 
+import { Palette } from "../src/core/palette";
 import { StreamDecoder } from "../src/core/stream";
 import { Packing, type Part } from "../src/view/packing";
 import { seeded } from "./simulate";
@@ -68,9 +69,12 @@ function attempt(bytes: Uint8Array, below: (n: number) => number, longest: numbe
   const parts: Part[] = [];
   const line = (what: string) => `${what}: ${Buffer.from(bytes).toString("base64")}`;
   try {
-    const decoder = new StreamDecoder(new Packing());
-    const cut = below(3) ? bytes.length : below(bytes.length + 1);
-    for (const piece of [bytes.slice(0, cut), bytes.slice(cut)]) parts.push(...decoder.push(piece));
+    const start = endOfPalette(bytes);
+    const palette = start ? new Palette(bytes.subarray(0, start)) : null;
+    const stream = bytes.subarray(start);
+    const decoder = new StreamDecoder(new Packing(), palette);
+    const cut = below(3) ? stream.length : below(stream.length + 1);
+    for (const piece of [stream.slice(0, cut), stream.slice(cut)]) parts.push(...decoder.push(piece));
     found.decoded += 1;
   } catch (error) {
     found.refused += 1;
@@ -84,6 +88,13 @@ function attempt(bytes: Uint8Array, below: (n: number) => number, longest: numbe
   const size = parts.reduce((sum, part) => sum + sizeOf(part), 0) / (PER_BYTE * WORDS * bytes.length || 1);
   found.largest = Math.max(found.largest, size);
   if (size > 1) found.wrong.push(line("more than its bytes may hold"));
+}
+
+/** Where the palette ends that a file begins with, if there is one; damage may move it. */
+export function endOfPalette(file: Uint8Array): number {
+  const view = new DataView(file.buffer, file.byteOffset, file.byteLength);
+  if (file.length < 16 || view.getUint32(0) !== 0x53475350) return 0;
+  return Math.min(16 + view.getUint32(12, true), file.length);
 }
 
 function sizeOf({ splats, harmonics, opacities, earlier }: Part): number {

@@ -305,6 +305,7 @@ export class FakeRenderer implements Renderer {
   swaps: { show: readonly Handle[]; hide: readonly Handle[] }[] = [];
   readonly corrupt = new Set<string>(); // "cell/level" that cannot be decoded
   begins: readonly number[] = [1]; // levels that a stream begins with
+  palettes: readonly (string | undefined)[] = []; // hashes of labels' palettes, which the last streams need
   /** Called after every swap. */
   watch: () => void = () => {};
 
@@ -320,9 +321,14 @@ export class FakeRenderer implements Renderer {
     bytes: Uint8Array,
     format: Format,
     below: readonly Uint8Array[] = [],
+    palette?: Parameters<Renderer["decode"]>[6],
   ): Promise<Handle> {
     const begin = this.begins.findLast((first) => first <= level) ?? 1;
     if (below.length !== (format === "stream" ? level - begin : 0)) throw new Error("without what is below");
+    const needed = level >= (this.begins.at(-1) ?? 1) ? this.palettes[label] : undefined;
+    if (palette?.sha256 !== needed || (palette && fnv(palette.bytes) !== needed)) {
+      throw new Error("not with its palette");
+    }
     const handle: Handle = { label, cell, level, count: bytes.length };
     return new Promise((resolve, reject) => {
       this.clock.after(this.delay, () => {

@@ -27,6 +27,7 @@ export function world(options: Options = {}, more: Partial<StreamerOptions> = {}
   const renderer = new FakeRenderer(clock);
   renderer.begins = [1, ...(options.replaces ?? [])];
   const manifest = more.manifest ?? bundle(network, options);
+  renderer.palettes = manifest.labels.map(({ palette }) => palette?.sha256);
   const settings = more.settings ?? DEFAULTS;
   const streamer = new Streamer({
     manifest,

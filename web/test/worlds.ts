@@ -83,6 +83,7 @@ export interface Options {
   readonly pack?: boolean;
   readonly replaces?: readonly number[]; // levels that replace those below
   readonly streams?: boolean; // each label is one file, the levels of its cells ranges of it
+  readonly palette?: number; // bytes of each label's palette, at the start of its file
 }
 
 /** A bundle whose files are on a network; label i stands at x = 4 i - 8, its cells side by side. */
@@ -96,7 +97,7 @@ export function bundle(network: Network, options: Options = {}): Manifest {
     live = false,
     promises = true,
   } = options;
-  const { pack = false, replaces = [], streams = false } = options;
+  const { pack = false, replaces = [], streams = false, palette = 0 } = options;
   const random = seeded(seed);
   const made = Array.from({ length: labels }, (_, id) => {
     const files = Array.from({ length: cells }, (_, j) =>
@@ -107,7 +108,9 @@ export function bundle(network: Network, options: Options = {}): Manifest {
         return replaces.includes(k + 1) ? { ...file, refine: "REPLACE" as const } : file;
       }),
     );
-    return labelOf(id, streams ? streamOf(network, `chunks/l${id}-${seed}.sgst`, files) : files, random);
+    const uri = `chunks/l${id}-${seed}.sgst`;
+    const label = labelOf(id, streams ? streamOf(network, uri, files, palette) : files, random);
+    return palette ? { ...label, palette: paletteIn(network, uri, palette) } : label;
   });
   const models =
     promises && labels ? new TextEncoder().encode(JSON.stringify(promisesOf(made, random))) : null;
@@ -143,9 +146,14 @@ export const manifestOf = (
 });
 
 /** Puts the files of cells one after the other into one. */
-function streamOf(network: Network, uri: string, cells: readonly (readonly Level[])[]): Level[][] {
-  const content = new Uint8Array(cells.flat().reduce((sum, { bytes }) => sum + bytes, 0));
-  let end = 0;
+function streamOf(
+  network: Network,
+  uri: string,
+  cells: readonly (readonly Level[])[],
+  palette: number,
+): Level[][] {
+  const content = new Uint8Array(cells.flat().reduce((sum, { bytes }) => sum + bytes, palette));
+  let end = palette;
   const levels = cells.map((files) =>
     files.map((file) => {
       content.set(network.files.get(file.uri) ?? [], end);
@@ -156,6 +164,12 @@ function streamOf(network: Network, uri: string, cells: readonly (readonly Level
   );
   network.files.set(uri, content);
   return levels;
+}
+
+/** The first bytes of a file. */
+function paletteIn(network: Network, uri: string, bytes: number) {
+  const content = network.files.get(uri)?.subarray(0, bytes) ?? new Uint8Array(0);
+  return { uri, offset: 0 as const, bytes, sha256: fnv(content) };
 }
 
 /** All increments, level by level. */

@@ -25,7 +25,7 @@ from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import put_ply, read_ply
 from sagesplat.formats.spz import SH_BITS, encode_spz, position_step, read_spz
-from sagesplat.formats.stream import Decoded, decode_stream, starts_of_streams
+from sagesplat.formats.stream import Decoded, decode_stream, palette_of, starts_of_streams
 from sagesplat.io.files import atomic_folder, write_json
 from sagesplat.io.typed import read_json_as
 
@@ -199,11 +199,12 @@ def streams_of(folder: Path, some: Sequence[Increment]) -> Iterator[tuple[Decode
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from None
     starts = starts_of_streams(content, name=str(path))
+    palette = palette_of(content, name=str(path))
     places = np.searchsorted(starts, [one.offset for one in some], "right") - 1
     for place, own in groupby(zip(places.tolist(), some, strict=True), key=itemgetter(0)):
         listed, start = [one for _, one in own], starts[place]
         end = max(one.offset + one.nbytes for one in listed)
-        decoded = decode_stream(content[start:end], label_id=listed[0].cell, name=str(path))
+        decoded = decode_stream(content[start:end], palette=palette, label_id=listed[0].cell, name=str(path))
         yield replace(decoded, start=start, ends=tuple(start + at for at in decoded.ends)), listed
 
 

@@ -42,6 +42,7 @@ from sagesplat.formats.stream_header import (
     restored,
     turned_round,
 )
+from sagesplat.formats.stream_palette import Palette, palette_end, read_palette
 from sagesplat.kernels.rans import Coder, Reader, Tables, Writer
 
 MAX_COUNT = 10_000_000  # Gaussians of a stream
@@ -88,6 +89,7 @@ def encode_stream(
     *,
     second: SecondOpacities | None = None,
     precision: Precision = Precision(),
+    palette: Palette | None = None,
     antialiased: bool = False,
     name: str = "stream",
 ) -> Encoded:
@@ -103,6 +105,7 @@ def encode_stream(
             levels of weight 1 they are the only ones. Levels that show the same Gaussians get one weight,
             that of the last.
         precision: Steps of quantisation. Finer ones than a model was trained with waste bytes.
+        palette: Of the file, which has the rows of all these harmonics. None: each is coded by itself.
         antialiased: How the scene was trained; a flag for viewers.
         name: What errors call the stream.
 
@@ -111,8 +114,8 @@ def encode_stream(
 
     Raises:
         DataError: For NaN or Inf, a quaternion of zeros, or too many Gaussians.
-        ValueError: For sizes that are no levels of N Gaussians, second opacities of others, or a precision
-            that the format does not have.
+        ValueError: For sizes that are no levels of N Gaussians, second opacities of others, or a palette of
+            other harmonics.
 
     Example:
         >>> import torch
@@ -133,9 +136,15 @@ def encode_stream(
     most = opacities_of(_most(g.logit_opacities, seconds, sizes, weights), precision.opacity)
     rows = np.flatnonzero(most > precision.least)
     g, seconds = turned_round(g.select(torch.from_numpy(rows))), seconds[torch.from_numpy(rows)]
-    made = header_of(g, len(sizes), precision, antialiased=antialiased, two_opacities=second is not None)
+    made = header_of(
+        g, len(sizes), precision, antialiased=antialiased, two_opacities=second is not None,
+        palette=palette is not None,
+    )  # fmt: skip
     header = read_header(made.pack())
-    columns = quantised(g, seconds, header)
+    columns = quantised(g, seconds, header, precision.sh_range)
+    if palette:
+        _check_palette(header, palette)
+        columns = replace(columns, entries=palette.entries(columns.harmonics))
     ends = np.searchsorted(rows, sizes)
     weights = [weights[np.searchsorted(ends, end, "right") - 1] for end in ends]
     one = np.repeat(weights, np.diff(ends, prepend=0)) == 255
@@ -178,7 +187,12 @@ def _most(
 
 
 def decode_stream(
-    content: bytes, levels: int | None = None, *, label_id: int = -1, name: str = "stream"
+    content: bytes,
+    levels: int | None = None,
+    *,
+    palette: Palette | None = None,
+    label_id: int = -1,
+    name: str = "stream",
 ) -> Decoded:
     """Decode the first `levels` levels of a stream, or all that are there.
 
@@ -187,6 +201,7 @@ def decode_stream(
     Args:
         content: The bytes, up to the end of any level.
         levels: How many levels to decode, at least 1. None: those that `content` has.
+        palette: Of the file, if it has one.
         label_id: What all Gaussians get.
         name: What errors call the stream.
 
@@ -201,6 +216,8 @@ def decode_stream(
         header = read_header(content)
         if levels is not None and not 1 <= levels <= header.levels:
             raise ValueError(f"level {levels} of {header.levels}")
+        if header.palette:
+            _check_palette(header, palette)
         tables, at, parts, weights = Tables(new_tables(header.layout)), SIZE, [], []
         ends, sizes = [], [0]
         deferred_opacities = 0  # parts from this one on are still without second opacities
@@ -225,9 +242,11 @@ def decode_stream(
             sizes.append(sizes[-1] + count)
         if len(sizes) == header.levels + 1 and at != len(content):
             raise ValueError(f"{len(content) - at} bytes after the last level")
+        columns, second = joined(parts, header.layout), None
+        if header.palette and palette:
+            columns = replace(columns, harmonics=palette.taken(columns.entries))
     except ValueError as error:
         raise _damaged(name, error) from None
-    columns, second = joined(parts, header.sh_degree), None
     if header.two_opacities:
         logits = logits_of(columns.seconds, header.opacity_step)
         second = SecondOpacities(logits, {label_id: tuple(w / 255 for w in weights)})
@@ -238,10 +257,13 @@ def decode_stream(
 def starts_of_streams(content: bytes, *, name: str = "streams") -> list[int]:
     """The first byte of each of the streams that lie one after the other, of which the last may be cut off.
 
+    A palette may be before them.
+
     DataError for another format or version, or damage.
     """
-    starts, at = [], 0
+    starts = []
     try:
+        at = palette_end(content)
         while at < len(content):
             starts.append(at)
             header = read_header(content[at : at + SIZE])
@@ -253,6 +275,30 @@ def starts_of_streams(content: bytes, *, name: str = "streams") -> list[int]:
     except ValueError as error:
         raise _damaged(name, error) from None
     return starts
+
+
+def end_of_palette(content: bytes, *, name: str = "streams") -> int:
+    """Where the palette ends that a file of streams begins with, 0 without one; DataError for damage."""
+    try:
+        return palette_end(content)
+    except ValueError as error:
+        raise _damaged(name, error) from None
+
+
+def palette_of(content: bytes, *, name: str = "streams") -> Palette | None:
+    """The palette that a file of streams begins with, if there is one; DataError for damage."""
+    try:
+        return read_palette(content)
+    except ValueError as error:
+        raise _damaged(name, error) from None
+
+
+def _check_palette(header: Header, palette: Palette | None) -> None:
+    """ValueError unless a stream's harmonics can be rows of this palette."""
+    if palette is None:
+        raise ValueError("no palette")
+    if (palette.sh_degree, palette.sh_bits) != (header.sh_degree, header.sh_bits):
+        raise ValueError("a palette of other harmonics")
 
 
 def _damaged(name: str, error: ValueError) -> DataError:

@@ -21,6 +21,7 @@ _SCALES, _COLOURS, _HARMONICS = 128, 160, 32  # symbols, the last of which is an
 _SCALE, _COLOUR, _HARMONIC = 64, 80, 15  # symbol of 0
 _ROTATION = ROTATIONS[-1]
 _GAPS = 3 * AXIS_BITS + 1
+PALETTE_BITS = 16  # of a row's number
 _OPACITIES = 256
 _CLASSES = 4  # of first opacities: rows of the table of second ones
 _PEAK = 512
@@ -39,6 +40,7 @@ class Columns:
     rotations: Int64[np.ndarray, "N 3"]  # x y z
     colours: Int64[np.ndarray, "N 3"]  # red, green, blue
     harmonics: Int64[np.ndarray, "N K 3"]
+    entries: Int64[np.ndarray, " N"]  # rows of the palette, if there is one; harmonics are then not coded
 
     def rows(self, rows: slice | np.ndarray) -> "Columns":
         """Some of the Gaussians."""
@@ -54,6 +56,7 @@ class Layout:
     two_opacities: bool
     rotation_origin: int
     rotation_spread: int
+    palette: bool = False
 
     def classes(self, scales: Int64[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
         """Rows of ROTATIONS: a large or a thin Gaussian needs small steps."""
@@ -61,11 +64,12 @@ class Layout:
         return (size // self.rotation_spread).clip(0, len(ROTATIONS) - 1)
 
 
-def joined(parts: list[Columns], sh_degree: int) -> Columns:
+def joined(parts: list[Columns], layout: Layout) -> Columns:
     """Columns one after the other."""
     none = np.zeros((0, 3), np.int64)
-    harmonics = np.zeros((0, BASES[sh_degree], 3), np.int64)
-    parts = [Columns(none[:, 0], none[:, 0], none[:, 0], none, none, none, harmonics), *parts]
+    harmonics = np.zeros((0, 0 if layout.palette else BASES[layout.sh_degree], 3), np.int64)
+    one = none[:, 0]
+    parts = [Columns(one, one, one, none, none, none, harmonics, one), *parts]
     return Columns(
         **{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Columns)}
     )
@@ -86,7 +90,15 @@ def new_tables(layout: Layout) -> dict[str, np.ndarray]:
         "rotation": np.stack([_within(steps) for steps in ROTATIONS]),
         "colour": np.stack([_peaked(_COLOURS, _COLOUR, 10), *[_peaked(_COLOURS, _COLOUR, 5)] * 2]),
     }
-    for degree in range(1, layout.sh_degree + 1):
+    if layout.palette:
+        return tables | {"entry": _peaked(PALETTE_BITS + 1, PALETTE_BITS - 1, 1)[None]}
+    return tables | harmonics_tables(layout.sh_degree)
+
+
+def harmonics_tables(sh_degree: int) -> dict[str, np.ndarray]:
+    """Those of `new_tables` that harmonics are coded by."""
+    tables = {}
+    for degree in range(1, sh_degree + 1):
         low, high = BASES[degree - 1 : degree + 1]
         tables[f"mask {degree}"] = np.stack([_few(high - low, max(4 - n, 2)) for n in range(low + 1)])
         for name, contexts in (("green", 1), ("red", 7), ("blue", 15)):
@@ -119,7 +131,8 @@ def code_columns(
     `before`: the Morton code before them in the level, or 0. `two`: second opacities are among them.
     """
     zero = np.zeros(count, np.int64)
-    gaps = _code_gaps(coder, zero, None if given is None else np.diff(given.positions, prepend=before))
+    wanted = None if given is None else np.diff(given.positions, prepend=before)
+    gaps = _code_lengths(coder, "gap", zero, wanted)
     opacities = coder.symbols("opacity", zero, None if given is None else given.opacities)
     seconds = opacities
     if two:
@@ -130,8 +143,12 @@ def code_columns(
         wanted = None if given is None else given.rotations[:, axis] + _ROTATION
         rotations[:, axis] = coder.symbols("rotation", classes, wanted) - _ROTATION
     colours = _code_colours(coder, zero, None if given is None else given.colours)
-    harmonics = _code_harmonics(coder, layout, zero, None if given is None else given.harmonics)
-    return Columns(before + gaps.cumsum(), opacities, seconds, scales, rotations, colours, harmonics)
+    entries, harmonics = zero, np.zeros((count, 0, 3), np.int64)
+    if layout.palette:
+        entries = _code_lengths(coder, "entry", zero, None if given is None else given.entries)
+    else:
+        harmonics = code_harmonics(coder, layout.sh_degree, count, None if given is None else given.harmonics)
+    return Columns(before + gaps.cumsum(), opacities, seconds, scales, rotations, colours, harmonics, entries)
 
 
 def code_seconds(coder: Coder, layout: Layout, opacities: np.ndarray, given: np.ndarray | None) -> np.ndarray:
@@ -140,10 +157,10 @@ def code_seconds(coder: Coder, layout: Layout, opacities: np.ndarray, given: np.
     return coder.symbols("second opacity", classes, given)
 
 
-def _code_gaps(coder: Coder, zero: np.ndarray, given: np.ndarray | None) -> np.ndarray:
-    """Differences of Morton codes: how many bits they have, then those below the highest."""
+def _code_lengths(coder: Coder, name: str, zero: np.ndarray, given: np.ndarray | None) -> np.ndarray:
+    """Numbers from 0 on: how many bits they have, then those below the highest."""
     lengths = None if given is None else np.frexp(given.astype(np.float64))[1].astype(np.int64)
-    lengths = coder.symbols("gap", zero, lengths)
+    lengths = coder.symbols(name, zero, lengths)
     return _code_bits(coder, np.minimum(lengths, 1), np.maximum(lengths - 1, 0), given)
 
 
@@ -169,11 +186,11 @@ def _code_colours(coder: Coder, zero: np.ndarray, given: np.ndarray | None) -> n
     return found
 
 
-def _code_harmonics(coder: Coder, layout: Layout, zero: np.ndarray, given: np.ndarray | None) -> np.ndarray:
-    """By degree: which coefficients are not grey zeros, then the values of these."""
-    found = np.zeros((len(zero), BASES[layout.sh_degree], 3), np.int64)
-    before = zero  # coefficients of lower degrees that are not zero
-    for degree in range(1, layout.sh_degree + 1):
+def code_harmonics(coder: Coder, sh_degree: int, count: int, given: np.ndarray | None) -> np.ndarray:
+    """Code `count` rows of harmonics: by degree, which coefficients are not grey zeros, then their values."""
+    found = np.zeros((count, BASES[sh_degree], 3), np.int64)
+    before = np.zeros(count, np.int64)  # coefficients of lower degrees that are not zero
+    for degree in range(1, sh_degree + 1):
         band = slice(BASES[degree - 1], BASES[degree])
         places = 1 << np.arange(band.stop - band.start)
         masks = None if given is None else given[:, band].any(2) @ places

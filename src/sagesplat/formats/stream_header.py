@@ -9,15 +9,14 @@ from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.core.sh import BASES
-from sagesplat.formats.quantisation import PER_COLOUR, in_buckets, logits_of_bytes
+from sagesplat.formats.quantisation import PER_COLOUR, logits_of_bytes
 from sagesplat.formats.spz import flipped
 from sagesplat.formats.stream_columns import AXIS_BITS, LARGEST, ROTATIONS, Columns, Layout
 
 MAGIC, VERSION = b"SGST", 3
 _HEADER = struct.Struct("<4sBBBBBBBBffffffhhhH")
 SIZE = _HEADER.size
-_ANTIALIASED, _TWO_OPACITIES = 1, 2  # flags
+_ANTIALIASED, _TWO_OPACITIES, _PALETTE = 1, 2, 4  # flags
 _FRAME = "rub"  # axes: right, up, back, as in SPZ
 _CELLS = 2**AXIS_BITS
 _SMALLEST = 2**-8  # step that a precision can ask for
@@ -27,6 +26,7 @@ _FARTHEST = 2**15 - 1  # magnitude of an origin
 _COARSEST = 1 / 3  # step of positions, of the median of the middle standard deviations: 0.002 of SSIM
 _ROUNDED = 2**17  # Gaussians at a time
 _LONGEST_LOG = 40  # magnitude of a log scale
+_SH_RANGE = 256.0  # magnitude of harmonics
 _RANGE = 1e18  # magnitude of a position; its square is finite in float32
 # by 3 times the first axis plus the second: the rotation wxyz that turns x and y to them or their opposites
 _TURNS = np.zeros((9, 4))
@@ -51,6 +51,7 @@ class Precision:
     rotation: float = -0.75  # classes finer than usual; two halve the steps
     least: float = 0.75  # opacity, in its steps: what never has more is left out
     grid: "Grid | None" = None  # instead of `position` and `rotation`: that of streams which were decoded
+    sh_range: float = 1.0  # harmonics beyond are cut, as in training
 
     def __post_init__(self) -> None:
         steps = (self.position, self.colour, self.log_scale)
@@ -58,18 +59,25 @@ class Precision:
             raise ValueError(f"steps {steps} and {self.opacity}/255 of opacities are not in the format")
         if not all(1 <= bits <= 8 for bits in self.sh_bits) or abs(self.rotation) > 9:
             raise ValueError(f"{self.sh_bits} bits, {self.rotation} classes; 1 to 8 and -9 to 9 are there")
+        if not 0 < self.sh_range <= _SH_RANGE:
+            raise ValueError(f"harmonics up to {self.sh_range}; {_SH_RANGE} are in the format")
         if not 0.5 <= self.least <= 255:
             raise ValueError(f"opacities of {self.least} steps; from 0.5 on they are in the format")
 
 
 # of Gaussians as they came in, ascending; harmonics need more bits where a picture shows them
 AS_GIVEN = (
-    Precision(position=1 / 8, opacity=3, log_scale=1 / 16, rotation=2.0),
-    Precision(position=1 / 8, opacity=3, log_scale=1 / 16, rotation=2.0, sh_bits=(6, 6)),
+    Precision(position=1 / 12, opacity=3, log_scale=1 / 16, rotation=2.0, sh_range=_SH_RANGE),
+    Precision(position=1 / 16, opacity=3, log_scale=1 / 12, rotation=0.5, sh_bits=(6, 6), sh_range=_SH_RANGE),
     Precision(
-        position=1 / 16, opacity=2, colour=1.0, log_scale=1 / 32, sh_bits=(7, 7), rotation=4.0, least=0.5
+        position=1 / 16, opacity=2, log_scale=1 / 16, rotation=1.0, sh_bits=(7, 7), sh_range=_SH_RANGE,
+        least=0.5,
     ),
-)
+    Precision(
+        position=1 / 32, opacity=1, colour=1.0, log_scale=1 / 32, sh_bits=(8, 8), sh_range=_SH_RANGE,
+        rotation=3.0, least=0.5,
+    ),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -91,6 +99,7 @@ class Header:
 
     antialiased: bool
     two_opacities: bool  # of each Gaussian, one for the low levels and one for the full model
+    palette: bool  # harmonics are rows of the file's palette
     sh_degree: int
     levels: int
     opacity_step: int  # of 1/255
@@ -109,12 +118,14 @@ class Header:
         """What it says of the columns."""
         opacities = -(-255 // self.opacity_step)
         return Layout(
-            self.sh_degree, opacities, self.two_opacities, self.rotation_origin, self.rotation_spread
-        )
+            self.sh_degree, opacities, self.two_opacities, self.rotation_origin, self.rotation_spread,
+            self.palette,
+        )  # fmt: skip
 
     def pack(self) -> bytes:
         """Its bytes."""
         flags = _ANTIALIASED * self.antialiased | _TWO_OPACITIES * self.two_opacities
+        flags |= _PALETTE * self.palette
         return _HEADER.pack(
             MAGIC, VERSION, flags, self.sh_degree, self.levels, self.opacity_step,
             *self.sh_bits, self.rotation_spread, *self.origin, self.step, self.scale_step, self.colour_step,
@@ -137,7 +148,7 @@ def read_header(content: bytes) -> Header:
     *origin, step, scale_step, colour_step, scales, colours, rotations, reserved = rest
     if version != VERSION:
         raise OtherVersionError(f"a stream of version {version}, and not {VERSION}")
-    if flags & ~(_ANTIALIASED | _TWO_OPACITIES) or reserved:
+    if flags & ~(_ANTIALIASED | _TWO_OPACITIES | _PALETTE) or reserved:
         raise ValueError(f"unknown flags {flags}")
     steps = np.array([step, scale_step, colour_step])
     reach = np.abs(origin) + step * _CELLS
@@ -145,9 +156,12 @@ def read_header(content: bytes) -> Header:
         raise ValueError("impossible steps")
     if degree > 3 or not levels or not opacity or not spread or not (1 <= low <= 8 and 1 <= high <= 8):
         raise ValueError(f"degree {degree}, {levels} levels, steps {opacity}, {low}, {high}, {spread}")
+    if flags & _PALETTE and not degree:
+        raise ValueError("a palette of no harmonics")
     return Header(
-        bool(flags & _ANTIALIASED), bool(flags & _TWO_OPACITIES), degree, levels, opacity, (low, high),
-        spread, (origin[0], origin[1], origin[2]), step, scale_step, colour_step, scales, colours, rotations,
+        bool(flags & _ANTIALIASED), bool(flags & _TWO_OPACITIES), bool(flags & _PALETTE), degree, levels,
+        opacity, (low, high), spread, (origin[0], origin[1], origin[2]), step, scale_step, colour_step,
+        scales, colours, rotations,
     )  # fmt: skip
 
 
@@ -164,7 +178,13 @@ def _steps(means: np.ndarray, logs: np.ndarray) -> tuple[float, float]:
 
 
 def header_of(
-    g: Gaussians, levels: int, precision: Precision, *, antialiased: bool, two_opacities: bool
+    g: Gaussians,
+    levels: int,
+    precision: Precision,
+    *,
+    antialiased: bool,
+    two_opacities: bool,
+    palette: bool = False,
 ) -> Header:
     """The header of a stream of these Gaussians, in right, up, back."""
     means, logs = g.means.double().numpy(), np.sort(g.log_scales.double().numpy(), axis=1)
@@ -184,6 +204,7 @@ def header_of(
     return Header(
         antialiased,
         two_opacities,
+        palette,
         g.sh_degree,
         levels,
         precision.opacity,
@@ -209,8 +230,11 @@ def logits_of(opacities: Int64[np.ndarray, " N"], step: int) -> Float32[Tensor, 
     return torch.from_numpy(logits_of_bytes(opacities * float(step)))
 
 
-def quantised(g: Gaussians, seconds: Tensor, header: Header) -> Columns:
-    """The columns of Gaussians in right, up, back; `seconds`: logits of their second opacities."""
+def quantised(g: Gaussians, seconds: Tensor, header: Header, sh_range: float) -> Columns:
+    """The columns of Gaussians in right, up, back; `seconds`: logits of their second opacities.
+
+    All coefficients are there, those of a palette's rows too.
+    """
     cells = np.rint((g.means.double().numpy() - header.origin) / header.step).astype(np.int64)
     logs = g.log_scales.double().numpy().clip(-_LONGEST_LOG, _LONGEST_LOG)
     axes = np.argsort(-logs, axis=1, kind="stable")
@@ -219,7 +243,6 @@ def quantised(g: Gaussians, seconds: Tensor, header: Header) -> Columns:
     steps = np.array(ROTATIONS)[header.layout.classes(scales)][:, None]
     xyz = _turned(g.quats.double().numpy(), axes)[:, 1:]
     colours = (g.sh0[:, 0].double().numpy() * PER_COLOUR + 127.5) / header.colour_step
-    harmonics = in_buckets(g.shN.double(), header.sh_bits).numpy() / _sh_steps(header)
     return Columns(
         spread_bits(cells.clip(0, _CELLS - 1)),
         np.rint(opacities_of(g.logit_opacities, header.opacity_step)).astype(np.int64),
@@ -227,8 +250,15 @@ def quantised(g: Gaussians, seconds: Tensor, header: Header) -> Columns:
         scales,
         np.rint(xyz * 2**0.5 * steps).astype(np.int64).clip(-steps, steps),
         (np.rint(colours) - header.colour_origin).clip(-LARGEST, LARGEST).astype(np.int64),
-        np.rint(harmonics).astype(np.int64),
+        harmonics_of(g.shN, header.sh_bits, sh_range),
+        np.zeros(len(g), np.int64),
     )
+
+
+def harmonics_of(shN: Tensor, sh_bits: tuple[int, int], sh_range: float) -> Int64[np.ndarray, "N K 3"]:
+    """SH coefficients [N, K, 3] in steps, cut to `sh_range`."""
+    values = shN.double().numpy().clip(-sh_range, sh_range)
+    return np.rint(values / _sh_steps(values.shape[1], sh_bits)).astype(np.int64)
 
 
 def restored(columns: Columns, header: Header, label_id: int) -> Gaussians:
@@ -239,7 +269,7 @@ def restored(columns: Columns, header: Header, label_id: int) -> Gaussians:
     xyz = columns.rotations * (0.5**0.5 / steps[:, None])
     quats = np.column_stack([np.sqrt((1 - (xyz**2).sum(1)).clip(0)), xyz])
     sh0 = ((columns.colours + header.colour_origin) * header.colour_step - 127.5) / PER_COLOUR
-    shN = columns.harmonics * _sh_steps(header)
+    shN = columns.harmonics * _sh_steps(columns.harmonics.shape[1], header.sh_bits)
     means, quats, shN = flipped(*(a.astype(np.float32) for a in (means, quats, shN)), _FRAME)
     return Gaussians(
         means=torch.from_numpy(means),
@@ -258,7 +288,7 @@ def rounded(g: Gaussians, precision: Precision) -> Gaussians:
     for first in range(0, len(g), _ROUNDED):  # integers take several times the memory
         part = turned_round(g.slices([slice(first, min(first + _ROUNDED, len(g)))]))
         header = header_of(part, 1, precision, antialiased=False, two_opacities=False)
-        columns = quantised(part, part.logit_opacities, header)
+        columns = quantised(part, part.logit_opacities, header, precision.sh_range)
         parts.append(replace(restored(columns, header, 0), label_ids=part.label_ids))
     return concat(parts)
 
@@ -272,9 +302,8 @@ def turned_round(g: Gaussians) -> Gaussians:
     )
 
 
-def _sh_steps(header: Header) -> Float64[np.ndarray, "K 1"]:
-    steps = np.repeat([2.0 ** (1 - bits) for bits in header.sh_bits], [3, 12])
-    return steps[: BASES[header.sh_degree], None]
+def _sh_steps(bases: int, sh_bits: tuple[int, int]) -> Float64[np.ndarray, "K 1"]:
+    return np.repeat([2.0 ** (1 - bits) for bits in sh_bits], [3, 12])[:bases, None]
 
 
 def _turned(quats: Float64[np.ndarray, "N 4"], axes: Int64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 4"]:

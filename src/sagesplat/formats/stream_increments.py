@@ -30,7 +30,8 @@ from sagesplat.formats.increments import (
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import put_ply
 from sagesplat.formats.stream import Encoded, encode_stream
-from sagesplat.formats.stream_header import Grid, Precision, position_steps
+from sagesplat.formats.stream_header import Grid, Precision, harmonics_of, position_steps, turned_round
+from sagesplat.formats.stream_palette import Palette
 from sagesplat.io.files import atomic_folder
 
 
@@ -74,6 +75,9 @@ def write_streams(
     the levels are kept from the last one on that replaces; None: exactly, as a PLY file each. `grids`: by
     cell id, of Gaussians that were decoded before, what they are rounded to already.
 
+    Where the levels that are kept so finely share rows of harmonics, the file of a category begins with their
+    palette, if that takes fewer bytes.
+
     What is hardly to be seen is left out (see `encode_stream`, whose errors are raised), and with it a cell
     or category that has nothing else. With `replaces`, a Gaussian of each set stays; and sets are PLY files
     where some Gaussians lie so far off that a stream's steps of positions would be too large for most.
@@ -86,11 +90,15 @@ def write_streams(
     made = list[_Set]()
     with atomic_folder(folder) as fresh:
         for label in labels:
-            content, mine = b"", list[_Set]()
-            for one, is_last in _sets(cells, sizes, replaces, [c for c in sizes if label_of[c] == label]):
-                part, stem = g.select(torch.from_numpy(one.rows)), stems[label]
-                precision = last if is_last else Precision()
-                if precision is None or (replaces and np.greater(*position_steps(part))):
+            mine, stem = list[_Set](), stems[label]
+            sets = _sets(cells, sizes, replaces, [c for c in sizes if label_of[c] == label])
+            far = {one: replaces and np.greater(*position_steps(_of(g, one))) for one, _ in sets}
+            finest = [one for one, is_last in sets if is_last and not far[one]]
+            palette = _palette(g, finest, last) if last and replaces else None
+            content = palette.encoded() if palette else b""
+            for one, is_last in sets:
+                part, precision = _of(g, one), last if is_last else Precision()
+                if precision is None or far[one]:
                     mine.append(_in_files(fresh, part, one, label, stem, antialiased))
                     continue
                 part = _with_one_seen(part, one.sizes[0], precision) if replaces else part
@@ -99,13 +107,14 @@ def write_streams(
                 )
                 coded = encode_stream(
                     part, one.sizes, second=own, antialiased=antialiased, name=stem,
+                    palette=palette if is_last else None,
                     precision=replace(precision, grid=(grids or {}).get(one.cell)),
                 )  # fmt: skip
                 if len(coded.rows):
                     ranges = _ranges(label, one, f"{stem}{STREAM}", len(content), coded, bits)
                     mine.append(replace(one, rows=one.rows[coded.rows], sizes=coded.sizes, increments=ranges))
                     content += coded.content
-            if content:
+            if any(one.increments and one.increments[0].format == "stream" for one in mine):
                 uri = f"{stems[label]}-{hashlib.sha256(content).hexdigest()[:12]}{STREAM}"
                 (fresh / uri).write_bytes(content)
                 mine = [replace(one, increments=_named(one.increments, uri)) for one in mine]
@@ -117,6 +126,18 @@ def write_streams(
         below = left.get(one.cell, ())
         left[one.cell] = below + tuple(end + (below[-1] if below else 0) for end in one.sizes)
     return Streams(written, left, np.concatenate([np.arange(0), *(one.rows for one in made)]))
+
+
+def _of(g: Gaussians, one: _Set) -> Gaussians:
+    return g.select(torch.from_numpy(one.rows))
+
+
+def _palette(g: Gaussians, sets: Sequence[_Set], precision: Precision) -> Palette | None:
+    """That of the harmonics of sets, if they are better coded by one."""
+    parts = [
+        harmonics_of(turned_round(_of(g, one)).shN, precision.sh_bits, precision.sh_range) for one in sets
+    ]
+    return Palette.of(np.concatenate(parts), precision.sh_bits) if parts else None
 
 
 def _sets(

@@ -55,7 +55,7 @@ _WEIGH = 32  # views that importance is measured in
 _REFIT = 24  # views that merged sets are fitted to, and trained ones are ordered by
 _TRAINED = 0.5  # largest share that is trained
 _SMALL = 0.1  # share up to which the fit takes more and larger steps: little is left as it was
-_KEPT = 0.999  # SSIM of the last level to what came in, from which it looks the same
+KEPT = 0.999  # SSIM of the last level to what came in, from which it looks the same
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
 
 
@@ -206,9 +206,10 @@ def _write(
     if not lossless and (other := sum(one.format != "stream" for one in made.increments)):
         job.emit(Warned(f"{other} files are PLY: some of their Gaussians lie too far off to be rounded"))
     write_cells(run.cells, describe_cells(sent, dict(label_of)))
-    everything = sum(one.nbytes for one in made.increments)
-    shown = sum(one.nbytes for one in full_scene(made.increments))
-    if ssim < _KEPT and not lossless:
+    everything = sum((run.increments / uri).stat().st_size for uri in {one.uri for one in made.increments})
+    palettes = everything - sum(one.nbytes for one in made.increments)  # which are in no increment
+    shown = sum(one.nbytes for one in full_scene(made.increments)) + palettes
+    if ssim < KEPT and not lossless:
         job.emit(
             Warned(f"rounding costs {1 - ssim:.4f} of SSIM; --lossless keeps the last level as it came in")
         )
@@ -224,7 +225,7 @@ def _write(
 def _precision(job: Job, g: Gaussians, targets: Sequence[tuple[int, np.ndarray]]) -> Precision:
     """The coarsest steps that Gaussians as they came in look the same in, else the finest."""
     for precision in AS_GIVEN[:-1]:
-        if _kept(job, rounded(g, precision), targets[::2])[0] >= _KEPT:
+        if _kept(job, rounded(g, precision), targets[::2])[0] >= KEPT:
             return precision
     return AS_GIVEN[-1]
 

@@ -13,6 +13,8 @@ from itertools import groupby
 from pathlib import Path
 
 from sagesplat.core.errors import DataError, RunError
+from sagesplat.formats.increments import STREAM
+from sagesplat.formats.stream import end_of_palette
 from sagesplat.io.files import atomic_folder, unwritable, write_text
 from sagesplat.io.typed import known_json
 from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_pack, with_poster
@@ -113,16 +115,20 @@ def is_bundle(folder: Path) -> bool:
 def verified_files(contents: Contents) -> Iterator[tuple[str, bytes]]:
     """The name and the content of each file that increments are in.
 
-    DataError where one is missing or not what the index says: the increments in it, one after the other.
+    DataError where one is missing or not what the index says: the increments in it, one after the other, and
+    before those of a file of streams maybe their palette.
     """
     # streams of a category's cells take turns in its file where some replace what is below
     chunks = sorted(contents.chunks, key=lambda chunk: (chunk.uri, chunk.offset))
     for uri, some in groupby(chunks, key=lambda chunk: chunk.uri):
-        path, at = contents.folder / uri, 0
+        path = contents.folder / uri
         try:
             content = path.read_bytes()
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror}); {_CURE}") from None
+        at = end_of_palette(content, name=str(path)) if uri.endswith(STREAM) else 0
+        if at and hashlib.sha256(content).hexdigest()[:12] not in uri:  # no chunk covers the palette
+            raise DataError(f"{path}: not the chunk that was written; {_CURE}")
         for chunk in some:
             part = content[at : at + chunk.nbytes]
             if chunk.offset != at or hashlib.sha256(part).hexdigest() != chunk.sha256:

@@ -155,7 +155,7 @@ def documents(
         photos = [entry.camera for entry in contents.cameras]
         promises["ssim"] = dumped(ssim_document(ssim, photos, seen))
         entries["ssim"] = {label: quality_entry(model) for label, model in ssim.items()}
-    cells = _cells(contents)
+    cells, palettes = _cells(contents), _palettes(contents)
     manifest = {
         "format": FORMAT,
         "version": VERSION,
@@ -173,7 +173,7 @@ def documents(
         },
         **({} if contents.ladder is None else {"ladder": contents.ladder}),
         "labels": [
-            _label(c, cells[c.label_id], entries, c.name in contents.hidden)
+            _label(c, cells[c.label_id], palettes.get(c.label_id), entries, c.name in contents.hidden)
             for c in contents.categories
             if c.label_id in cells
         ],
@@ -222,6 +222,7 @@ def pack_order(contents: Contents) -> list[tuple[int, int]]:
 def _label(
     category: Category,
     cells: Sequence[dict[str, Any]],
+    palette: dict[str, Any] | None,
     entries: Mapping[QualityKind, Mapping[int, dict[str, Any]]],
     hidden: bool,
 ) -> dict[str, Any]:
@@ -234,6 +235,7 @@ def _label(
         "weight": significant(category.weight),
         "always": category.always,
         **({"hidden": True} if hidden else {}),
+        **({} if palette is None else {"palette": palette}),
         "cells": cells,
         "quality": {
             quality: some[category.label_id] for quality, some in entries.items() if category.label_id in some
@@ -247,6 +249,22 @@ def _cells(contents: Contents) -> dict[int, list[dict[str, Any]]]:
     for row, (cell, label) in enumerate(contents.shown.label_of.items()):
         levels = [_level(chunk) for chunk in contents.files[cell]]
         found.setdefault(label, []).append({**placed(contents.shown, row), "levels": levels})
+    return found
+
+
+def _palettes(contents: Contents) -> dict[int, dict[str, Any]]:
+    """By label id, the entries of the palettes: what comes before the first stream of a file."""
+    firsts: dict[str, Increment] = {}
+    for chunk in sorted(contents.chunks, key=lambda chunk: chunk.offset):
+        firsts.setdefault(chunk.uri, chunk)
+    found = {}
+    for uri, first in firsts.items():
+        if first.offset:
+            with (contents.folder / uri).open("rb") as file:
+                digest = hashlib.sha256(file.read(first.offset)).hexdigest()
+            found[first.label_id] = {
+                "uri": f"chunks/{uri}", "offset": 0, "bytes": first.offset, "sha256": digest,
+            }  # fmt: skip
     return found
 
 

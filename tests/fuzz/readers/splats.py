@@ -17,8 +17,10 @@ from sagesplat.formats.levels import check_level, read_level, write_level, write
 from sagesplat.formats.offsets import read_offset
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.spz import encode_spz, read_spz
-from sagesplat.formats.stream import decode_stream, encode_stream, starts_of_streams
+from sagesplat.formats.stream import decode_stream, encode_stream, palette_of, starts_of_streams
+from sagesplat.formats.stream_header import harmonics_of, turned_round
 from sagesplat.formats.stream_increments import read_streams
+from sagesplat.formats.stream_palette import Palette
 from sagesplat.scene.scene import Camera, Lens, Points, Scene, View
 from sagesplat.scene.stored import read_scene, write_scene
 from sagesplat.segment.lift import LiftedLabels
@@ -49,13 +51,15 @@ def _streams(folder: Path, size: int) -> list[bytes]:
     second = SecondOpacities(torch.linspace(-3, 3, 5), {2: (0.0, 0.5, 1.0)})
     some = [encode_stream(splats(5, bases), [1, 3, 5]).content for bases in (0, 3, 15)]
     some.append(encode_stream(splats(5), [1, 3, 5], second=second).content)
-    return [*some, some[0] + some[-1] + some[1]]
+    palette = Palette(1, (5, 4), harmonics_of(turned_round(splats(5)).shN, (5, 4), 1.0))
+    rows = encode_stream(splats(5), [1, 3, 5], palette=palette).content
+    return [*some, some[0] + some[-1] + some[1], palette.encoded() + rows + some[0]]
 
 
 def _read_streams(folder: Path, content: bytes) -> None:
-    starts = starts_of_streams(content)
+    starts, palette = starts_of_streams(content), palette_of(content)
     for start, end in pairwise([*starts, len(content)]):
-        decode_stream(content[start:end])
+        decode_stream(content[start:end], palette=palette)
 
 
 def _equal(count: int) -> Gaussians:

@@ -11,6 +11,7 @@ const POSITION_BITS = 51;
 const PEAK = 512; // count of the likeliest symbol of a new table
 const CLASSES = 4; // of first opacities: rows of the table of second ones
 const FLAT = 128; // of each symbol of a new table where none is likelier
+const ENTRY_BITS = 16; // of the number of a palette's row
 const LIKELY = 64; // of an opacity that is not the largest
 
 const peak = (likeliest: number, half: number) => (symbol: number) =>
@@ -31,6 +32,7 @@ export class Block {
   readonly rotations = triple(); // x, y, z
   readonly colours = triple(); // r, g, b
   readonly harmonics: readonly Harmonics[];
+  readonly entries = column(); // rows of the palette, if there is one; `harmonics` are then empty
 
   constructor(degree: number) {
     this.harmonics = Array.from({ length: degree }, (_, i) => new Harmonics(2 * i + 3));
@@ -85,6 +87,7 @@ function tablesOf(degree: number): Tables {
 /** What every stream begins with. */
 const NEW = {
   gap: new Table(1, POSITION_BITS + 1, peak(18, 3)),
+  entry: new Table(1, ENTRY_BITS + 1, peak(ENTRY_BITS - 1, 1)),
   scale: new Table(3, 128, (symbol, row) => (row ? peak(5, 5) : peak(64, 5))(symbol)),
   rotation: new Table(11, 255, (symbol, row) =>
     Math.abs(symbol - 127) <= (ROTATIONS[row] as number) ? FLAT : 0,
@@ -103,20 +106,23 @@ export class Columns {
   private readonly rotation = NEW.rotation.copy();
   private readonly colour = NEW.colour.copy();
   private readonly bands: readonly Tables[];
+  private readonly entry = NEW.entry.copy();
   private readonly tables: Table[];
 
-  constructor(private readonly header: Header) {
+  /** @param rows - of the palette, 0: none */
+  constructor(
+    private readonly header: Header,
+    private readonly rows: number,
+  ) {
     const [least, most] = [header.twoOpacities ? 0 : 1, Math.ceil(255 / header.opacityStep)];
     const flat = (symbol: number) => (symbol >= least && symbol <= most ? LIKELY : 0);
     const opaque = (symbol: number) => (symbol === most ? PEAK : flat(symbol));
     this.opacity = new Table(1, 256, opaque);
     this.second = new Table(CLASSES, 256, (symbol, row) => (row < CLASSES - 1 ? flat : opaque)(symbol));
     this.largest = most;
-    this.bands = NEW.bands.slice(0, header.degree).map(([masks, green, red, blue]) => {
-      return [masks.copy(), green.copy(), red.copy(), blue.copy()];
-    });
-    const { gap, second, scale, rotation, colour, bands } = this;
-    this.tables = [gap, this.opacity, second, scale, rotation, colour, ...bands.flat()];
+    this.bands = rows ? [] : newBands(header.degree);
+    const { gap, second, scale, rotation, colour, entry, bands } = this;
+    this.tables = [gap, this.opacity, second, scale, rotation, colour, entry, ...bands.flat()];
   }
 
   /**
@@ -131,10 +137,8 @@ export class Columns {
     this.decodeScales(reader, block, count);
     for (const column of block.rotations) reader.ofRows(this.rotation, block.classes, 127, column, count);
     this.decodeColours(reader, block.colours, count);
-    lower.fill(0, 0, count);
-    block.harmonics.forEach((harmonics, i) => {
-      decodeHarmonics(reader, this.bands[i] as Tables, harmonics, count);
-    });
+    if (this.rows) this.decodeEntries(reader, block.entries, count);
+    else decodeBands(reader, this.bands, block.harmonics, count);
     return last;
   }
 
@@ -143,9 +147,7 @@ export class Columns {
   }
 
   private decodePositions(reader: Reader, [x, y, z]: Triple, count: number, before: number): number {
-    reader.ofRow(this.gap, 0, 1, widths, count);
-    for (let i = 0; i < count; i++) wide[i] = (widths[i] as number) < 0 ? 0 : 1;
-    reader.bits(widths, wide, count);
+    readLengths(reader, this.gap, count);
     let code = before;
     for (let i = 0; i < count; i++) {
       code += wide[i] as number;
@@ -162,6 +164,15 @@ export class Columns {
       z[i] = (a >> 8) | ((b >> 8) << 4) | ((c >> 8) << 8) | ((d >> 8) << 12) | ((e >> 8) << 16);
     }
     return code;
+  }
+
+  private decodeEntries(reader: Reader, entries: Int32Array, count: number): void {
+    readLengths(reader, this.entry, count);
+    for (let i = 0; i < count; i++) {
+      const entry = wide[i] as number;
+      if (entry >= this.rows) throw new Error("a row that the palette does not have");
+      entries[i] = entry;
+    }
   }
 
   private decodeOpacities(reader: Reader, block: Block, count: number, two: boolean): void {
@@ -206,6 +217,32 @@ export class Columns {
       blue[i] = (blue[i] as number) + g;
     }
   }
+}
+
+/** Decodes numbers from 0 on into `wide`: how many bits they have, then those below the highest. */
+function readLengths(reader: Reader, table: Table, count: number): void {
+  reader.ofRow(table, 0, 1, widths, count);
+  for (let i = 0; i < count; i++) wide[i] = (widths[i] as number) < 0 ? 0 : 1;
+  reader.bits(widths, wide, count);
+}
+
+/** The tables that harmonics begin with, by degree. */
+export const newBands = (degree: number): Tables[] =>
+  NEW.bands.slice(0, degree).map(([masks, green, red, blue]) => {
+    return [masks.copy(), green.copy(), red.copy(), blue.copy()];
+  });
+
+/** Decodes `count` rows of harmonics. */
+export function decodeBands(
+  reader: Reader,
+  bands: readonly Tables[],
+  harmonics: readonly Harmonics[],
+  count: number,
+): void {
+  lower.fill(0, 0, count);
+  bands.forEach((tables, i) => {
+    decodeHarmonics(reader, tables, harmonics[i] as Harmonics, count);
+  });
 }
 
 /** Adds to `lower` what is not 0 of this degree. */

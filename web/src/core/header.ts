@@ -3,12 +3,14 @@
 export const HEADER_BYTES = 44;
 const MAGIC = 0x53475354;
 const VERSION = 3;
+const PALETTE = 4; // flag
 const GREATEST = 1e18;
 
 /** What a stream says of all its Gaussians. */
 export interface Header {
   readonly antialiased: boolean;
   readonly twoOpacities: boolean;
+  readonly palette: boolean; // harmonics are rows of the file's palette
   readonly degree: number;
   readonly levels: number;
   readonly opacityStep: number; // of 1/255
@@ -28,11 +30,12 @@ export function readHeader(bytes: Uint8Array): Header {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   if (bytes.length < HEADER_BYTES || view.getUint32(0) !== MAGIC) throw new Error("not a sagesplat-stream");
   if (view.getUint8(4) !== VERSION) throw new Error("a stream of another version");
-  if (view.getUint8(5) > 3 || view.getUint16(42, true)) throw new Error("a stream with unknown flags");
+  if (view.getUint8(5) > 7 || view.getUint16(42, true)) throw new Error("a stream with unknown flags");
   const float = (at: number) => view.getFloat32(at, true);
   const header: Header = {
     antialiased: (view.getUint8(5) & 1) > 0,
     twoOpacities: (view.getUint8(5) & 2) > 0,
+    palette: (view.getUint8(5) & PALETTE) > 0,
     degree: view.getUint8(6),
     levels: view.getUint8(7),
     opacityStep: view.getUint8(8),
@@ -50,7 +53,8 @@ export function readHeader(bytes: Uint8Array): Header {
   const steps = [step, scaleStep, colourStep].every((s) => s >= 1 / GREATEST && s <= GREATEST);
   const inReach = origin.every((at) => Math.abs(at) + step * 2 ** 17 <= GREATEST);
   const bits = shBits.every((n) => n >= 1 && n <= 8);
-  if (!steps || !inReach || !bits || header.degree > 3 || !levels || !opacityStep || !spread) {
+  const rows = header.palette && !header.degree;
+  if (!steps || !inReach || !bits || rows || header.degree > 3 || !levels || !opacityStep || !spread) {
     throw new Error("a stream with an impossible header");
   }
   return header;

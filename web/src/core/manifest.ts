@@ -6,13 +6,12 @@ import {
   type CellPromises,
   type Label,
   type LabelPromises,
-  type Level,
   type Manifest,
   type Promises,
   QUALITIES,
   type Quality,
 } from "../types";
-import type { Fetch } from "./download";
+import type { Fetch, File } from "./download";
 import { filesOf } from "./pack";
 import { levelsOf } from "./quality";
 import { BundleError, checked, refuse, type Schema } from "./schema";
@@ -89,9 +88,9 @@ const ALONE = "must be one stream, in a file of the label's own";
 /** Of a cell, the levels that are ranges touch from one that replaces to the next; all of a label fill a file. */
 function streamDefects({ labels }: Manifest): string[] {
   const others = new Set<string>(); // files of the labels before
-  return labels.flatMap(({ cells }, i) => {
+  return labels.flatMap(({ cells, palette }, i) => {
     const wrong: string[] = [];
-    const ranges: Level[] = [];
+    const ranges: File[] = palette ? [palette] : [];
     for (const [j, { levels }] of cells.entries()) {
       const odd = (what: string) => wrong.push(`labels[${i}].cells[${j}].levels ${what}`);
       const streams = levels.filter(({ format }) => format === "stream");

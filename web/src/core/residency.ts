@@ -2,6 +2,7 @@
 
 import type { Cell, Handle, Label, Level, Renderer } from "../types";
 import { Points, type Sight } from "./distance";
+import type { File } from "./download";
 import { type Candidate, type Ladder, ladderOf } from "./planner";
 
 /** An increment with its value: pixel-weighted SSIM gain per byte, along the concave hull. */
@@ -44,6 +45,12 @@ export class Entry {
   below(level: number): readonly Uint8Array[] {
     if (this.cell.levels[level - 1]?.format !== "stream") return [];
     return this.contents.slice(this.start(level), level - 1).flatMap((content) => content ?? []);
+  }
+
+  /** The palette that a level is decoded by: that of a label is for the highest levels, from one that replaces on. */
+  paletteOf(level: number): File | undefined {
+    const { palette } = this.label;
+    return this.start(level) === this.start(this.cell.levels.length) ? palette : undefined;
   }
 
   /** Number of increments below a level that are not part of it, since it or a level below it replaces them. */

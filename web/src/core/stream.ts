@@ -2,6 +2,7 @@
 
 import { Block, Columns, LARGEST } from "./columns";
 import { HEADER_BYTES, type Header, readHeader } from "./header";
+import type { Palette } from "./palette";
 import { Reader } from "./rans";
 
 const MAX_COUNT = 10_000_000;
@@ -12,7 +13,7 @@ const ALL_SECOND = 255; // weight of a level whose Gaussians have one opacity, w
 /** Makes of a stream's Gaussians what a caller wants of a level. */
 export interface Sink<Level> {
   /** A level to be filled; with it come second opacities of the `deferred` Gaussians before it. */
-  begin(header: Header, count: number, deferred: number): Level;
+  begin(header: Header, count: number, deferred: number, palette: Palette | null): Level;
   /** Takes the first `count` rows of a block as the rows of the level from `start` on. */
   put(level: Level, block: Block, start: number, count: number): void;
   /** Takes the second opacities of a block as those of the deferred Gaussians from `start` on. */
@@ -28,7 +29,11 @@ export class StreamDecoder<Level> {
   private deferred = new Uint8Array(0); // first opacities of the newest Gaussians, those without second ones
   private levels = 0;
 
-  constructor(private readonly sink: Sink<Level>) {}
+  /** @param palette - of the file, if it has one */
+  constructor(
+    private readonly sink: Sink<Level>,
+    private readonly palette: Palette | null = null,
+  ) {}
 
   /** Whether all levels are decoded. */
   get isComplete(): boolean {
@@ -46,7 +51,9 @@ export class StreamDecoder<Level> {
     if (!this.header) {
       if (this.waiting.length < HEADER_BYTES) return [];
       this.header = readHeader(this.waiting);
-      this.columns = new Columns(this.header);
+      if (this.header.palette && !this.palette) throw new Error("no palette");
+      if (this.header.palette) this.palette?.check(this.header);
+      this.columns = new Columns(this.header, this.header.palette ? (this.palette?.count ?? 0) : 0);
       this.waiting = this.waiting.subarray(HEADER_BYTES);
     }
     const found: Level[] = [];
@@ -69,7 +76,8 @@ export class StreamDecoder<Level> {
     }
     if (Number.isNaN(size) || this.waiting.length < start + size) return null;
     const weight = header.twoOpacities ? (this.waiting[afterSize] as number) : ALL_SECOND;
-    const level = this.sink.begin(header, count, count && weight ? this.deferred.length : 0);
+    const deferred = count && weight ? this.deferred.length : 0;
+    const level = this.sink.begin(header, count, deferred, header.palette ? this.palette : null);
     if (count) this.decode(this.waiting.subarray(start, start + size), level, count, weight);
     this.waiting = this.waiting.subarray(start + size);
     this.levels++;

@@ -48,6 +48,12 @@ const WITHOUT_MODELS = "levels are planned by what holds for all viewpoints.";
 const LENS = [0.8, 0.5] as const; // until there is a viewpoint
 const UNCHECKED = "Served without https: files are checked by their size only.";
 
+/** All that are ranges of files, palettes included. */
+const rangesIn = (entries: readonly Entry[]): File[] => {
+  const palettes = entries.flatMap(({ label }) => label.palette ?? []);
+  return [...new Set(palettes), ...entries.flatMap(({ cell }) => cell.levels)];
+};
+
 export class Streamer {
   private readonly renderer: Renderer;
   private readonly clock: Clock;
@@ -67,6 +73,7 @@ export class Streamer {
   private nextPlan = -Infinity; // ms of the clock: earliest time
   private nextWork = -Infinity;
   private postponed = false; // an update is scheduled
+  private readonly palettes = new Map<string, Uint8Array>(); // that have arrived, by hash
   private wantedKeys = new Set<string>(); // of all files of the plan
   private dirty = false;
   private decodes = 0;
@@ -96,7 +103,7 @@ export class Streamer {
       changed: () => this.arrived(),
       ...(options.downloads && { maxDownloads: options.downloads }),
     });
-    this.downloads.setRanges(this.entries.flatMap(({ cell }) => cell.levels));
+    this.downloads.setRanges(rangesIn(this.entries));
     const { position, quaternion } = manifest.start;
     this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [], lens: LENS };
   }
@@ -215,11 +222,15 @@ export class Streamer {
     }
     this.wantedKeys = new Set(this.entries.flatMap((e) => e.path.map((f) => f.file.sha256)));
     if (this.promises) this.wantedKeys.add(this.promises.sha256);
+    for (const { label } of this.entries) if (label.palette) this.wantedKeys.add(label.palette.sha256);
   }
 
   /** Highest available level of a cell: below its first damaged increment. */
   private highest(entry: Entry): number {
-    const broken = entry.cell.levels.findIndex((file) => this.downloads.failure(file)?.lasting);
+    const broken = entry.cell.levels.findIndex((file, i) => {
+      const palette = entry.paletteOf(i + 1);
+      return [file, ...(palette ? [palette] : [])].some((one) => this.downloads.failure(one)?.lasting);
+    });
     return broken < 0 ? entry.cell.levels.length : broken;
   }
 
@@ -240,7 +251,8 @@ export class Streamer {
     this.hidden.shrink(this.settings.cacheBytes);
     this.decodeMore();
     const promises = this.missingPromises();
-    const queue = inOrder(this.entries, this.downloads, promises, this.promisesCanWait());
+    const planned = inOrder(this.entries, this.downloads, promises, this.promisesCanWait());
+    const queue = [...this.missingPalettes(), ...planned];
     this.pending = queue.length;
     this.downloads.keepOnly(this.wantedKeys);
     const undecided =
@@ -268,6 +280,19 @@ export class Streamer {
     if (!this.downloads.hasPack || this.planned !== "ok" || (mode !== "full" && mode !== "base"))
       return false;
     return (promises?.bytes ?? 0) > DELAYING_SHARE * (pack?.bytes ?? 0);
+  }
+
+  /** The palettes that have not arrived of levels that are next. */
+  private missingPalettes(): File[] {
+    const needed = this.entries.flatMap((entry) => (entry.next && entry.paletteOf(entry.next)) || []);
+    return [...new Set(needed)].filter(({ sha256 }) => !this.palettes.has(sha256));
+  }
+
+  private takePalettes(): void {
+    for (const palette of this.missingPalettes()) {
+      const content = this.downloads.take(palette);
+      if (content) this.palettes.set(palette.sha256, content);
+    }
   }
 
   private missingPromises(): File[] {
@@ -305,17 +330,28 @@ export class Streamer {
     const file = entry.cell.levels[level - 1];
     if (!file || entry.decoding || this.decodes >= MAX_DECODES) return;
     if (this.downloads.failure(file)?.lasting) return;
+    const palette = entry.paletteOf(level);
+    const bytes = palette && this.palettes.get(palette.sha256);
+    if (palette && !bytes) return;
     const content = entry.contents[level - 1] ?? this.downloads.take(file);
-    if (content) void this.decode(entry, file, level, content);
+    const known = palette && bytes && { sha256: palette.sha256, bytes };
+    if (content) void this.decode(entry, file, level, content, known);
   }
 
-  private async decode(entry: Entry, file: Level, level: number, content: Uint8Array): Promise<void> {
+  private async decode(
+    entry: Entry,
+    file: Level,
+    level: number,
+    content: Uint8Array,
+    palette: Parameters<Renderer["decode"]>[6],
+  ): Promise<void> {
     entry.decoding = level;
     this.decodes += 1;
     let handle: Handle | undefined;
     try {
       const { label, cell } = entry;
-      handle = await this.renderer.decode(label.id, cell.id, level, content, file.format, entry.below(level));
+      const below = entry.below(level);
+      handle = await this.renderer.decode(label.id, cell.id, level, content, file.format, below, palette);
       if (file.format === "stream") entry.contents[level - 1] = content;
     } catch {
       this.downloads.markCorrupt(file, `${file.uri} cannot be decoded`);
@@ -336,6 +372,7 @@ export class Streamer {
   private arrived(): void {
     if (this.phase !== "running") return;
     this.takePromises();
+    this.takePalettes();
     const capped = this.entries.some((entry) => entry.wanted > this.highest(entry));
     if (capped) this.plan();
     else this.work();
@@ -383,7 +420,7 @@ export class Streamer {
     this.leaving.push(...leaving);
     this.modelsByQuality.clear();
     this.content = manifest;
-    this.downloads.setRanges(entries.flatMap(({ cell }) => cell.levels));
+    this.downloads.setRanges(rangesIn(entries));
     this.trouble = null;
     this.downloads.clearFailures();
     this.plan();
@@ -403,7 +440,7 @@ export class Streamer {
 
   /** Whether a failed download will soon be retried. */
   private retrying(): boolean {
-    return [...this.wantedFiles(), ...this.missingPromises()].some((file) => {
+    return [...this.wantedFiles(), ...this.missingPromises(), ...this.missingPalettes()].some((file) => {
       const failure = this.downloads.failure(file);
       return failure !== undefined && !failure.lasting && failure.tries < TRIES_BEFORE_NOTICE;
     });
@@ -450,8 +487,9 @@ export class Streamer {
         !this.digest && UNCHECKED,
       ].map((note) => note || null),
       failure: (entry, level) => {
-        const file = entry.cell.levels[level - 1];
-        return file && this.downloads.failure(file);
+        const files = [entry.cell.levels[level - 1], entry.paletteOf(level)];
+        const failures = files.map((file) => file && this.downloads.failure(file));
+        return failures.find((failure) => failure !== undefined);
       },
     });
   }

@@ -1,5 +1,6 @@
 /** Decodes coded streams in a worker, or on the page's own thread where there is none. */
 
+import { Palette } from "../core/palette";
 import { StreamDecoder } from "../core/stream";
 import { Packing, type Part } from "./packing";
 
@@ -9,6 +10,13 @@ export interface Job {
   readonly stream: number;
   readonly from: number; // increments that were decoded before; 0: the stream begins anew
   readonly increments: readonly Uint8Array[];
+  readonly palette?: PaletteBytes | undefined; // of the file, where the stream begins anew
+}
+
+/** A palette as it came, and what it is known by. */
+export interface PaletteBytes {
+  readonly sha256: string;
+  readonly bytes: Uint8Array;
 }
 
 /** The answer to a job. */
@@ -20,11 +28,14 @@ export interface Answer {
 /** The streams that are being decoded, each where it was left. */
 export class Streams {
   private readonly decoders = new Map<number, StreamDecoder<Part>>();
+  private readonly palettes = new Map<string, Palette>(); // by hash: many streams have the same
 
   /** Decodes the increments of a job; a part for the last one. */
-  answer({ id, stream, from, increments }: Job): Answer {
+  answer({ id, stream, from, increments, palette }: Job): Answer {
     try {
-      const decoder = from ? this.decoders.get(stream) : new StreamDecoder(new Packing());
+      const decoder = from
+        ? this.decoders.get(stream)
+        : new StreamDecoder(new Packing(), palette ? this.paletteOf(palette) : null);
       if (!decoder) throw new Error("a stream that was not begun");
       this.decoders.set(stream, decoder);
       let parts: Part[] = [];
@@ -37,6 +48,12 @@ export class Streams {
       this.decoders.delete(stream);
       return { id, part: null };
     }
+  }
+
+  private paletteOf({ sha256, bytes }: PaletteBytes): Palette {
+    const palette = this.palettes.get(sha256) ?? new Palette(bytes);
+    this.palettes.set(sha256, palette);
+    return palette;
   }
 }
 
@@ -52,6 +69,7 @@ export type Start = (answered: (answer: Answer) => void, failed: () => void) => 
 interface Waiting {
   readonly stream: number;
   readonly increments: readonly Uint8Array[]; // all from the first one on
+  readonly palette: PaletteBytes | undefined;
   readonly done: (part: Part | null) => void;
 }
 
@@ -70,8 +88,9 @@ export class Decoders {
    *
    * @param stream - a number of the caller's
    * @param increments - of the stream, from the first one to the one that is asked for
+   * @param palette - of its file, if it needs one
    */
-  decode(stream: number, increments: readonly Uint8Array[]): Promise<Part> {
+  decode(stream: number, increments: readonly Uint8Array[], palette?: PaletteBytes): Promise<Part> {
     return new Promise((resolve, reject) => {
       const done = (part: Part | null) => {
         if (part) return resolve(part);
@@ -79,7 +98,7 @@ export class Decoders {
         reject(new Error("a damaged stream"));
       };
       const id = ++this.jobs;
-      this.waiting.set(id, { stream, increments, done });
+      this.waiting.set(id, { stream, increments, palette, done });
       this.send(id, this.done.get(stream) ?? 0);
     });
   }
@@ -95,10 +114,16 @@ export class Decoders {
   private send(id: number, decoded: number): void {
     const job = this.waiting.get(id);
     if (!job) return;
-    const { stream, increments } = job;
+    const { stream, increments, palette } = job;
     const from = decoded < increments.length ? decoded : 0; // an earlier one: from the beginning
     this.done.set(stream, increments.length);
-    const message: Job = { id, stream, from, increments: increments.slice(from) };
+    const message: Job = {
+      id,
+      stream,
+      from,
+      increments: increments.slice(from),
+      ...(!from && palette && { palette }),
+    };
     const peer = this.worker();
     if (peer) peer.postMessage(message);
     else if (this.own) this.take(this.own.answer(message));

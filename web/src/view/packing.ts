@@ -2,6 +2,7 @@
 
 import { type Block, type Harmonics, ROTATIONS } from "../core/columns";
 import type { Header } from "../core/header";
+import type { Palette } from "../core/palette";
 import type { Sink } from "../core/stream";
 
 export const HARMONICS = ["sh1", "sh2", "sh3"] as const;
@@ -66,9 +67,10 @@ export class Packing implements Sink<Part> {
   private colour = this.scale;
   private alpha = new Uint8Array(0); // in 1/255, by opacity
   private coefficients: readonly Lookup[] = [];
+  private rows: readonly Uint32Array[] = []; // words of the palette, by degree
 
-  begin(header: Header, count: number, deferred: number): Part {
-    if (header !== this.header) this.prepare(header);
+  begin(header: Header, count: number, deferred: number, palette: Palette | null): Part {
+    if (header !== this.header) this.prepare(header, palette);
     const harmonics = HARMONICS.slice(0, header.degree).map(
       (key) => [key, new Uint32Array(count * WORDS[key])] as const,
     );
@@ -83,11 +85,9 @@ export class Packing implements Sink<Part> {
     this.putColours(part.splats, block, start, count);
     this.putPositions(part.splats, block, start, count);
     this.putShapes(part.splats, block, start, count);
-    block.harmonics.forEach((harmonics, i) => {
-      const key = HARMONICS[i] as "sh1";
-      const words = part.harmonics.get(key) as Uint32Array;
-      putHarmonics(words, WORDS[key], BITS[i] as number, this.coefficients[i] as Lookup, harmonics, start);
-    });
+    const words = [...part.harmonics.values()];
+    if (this.rows.length) putRows(words, this.rows, block.entries, start, count);
+    else this.putHarmonics(words, block.harmonics, start);
   }
 
   putSeconds(part: Part, { seconds }: Block, start: number, count: number): void {
@@ -95,7 +95,26 @@ export class Packing implements Sink<Part> {
     for (let i = 0; i < count; i++) out[start + i] = this.alpha[seconds[i] as number] as number;
   }
 
-  private prepare(header: Header): void {
+  private putHarmonics(words: readonly Uint32Array[], harmonics: readonly Harmonics[], start: number): void {
+    harmonics.forEach((own, i) => {
+      const [row, bits] = [WORDS[HARMONICS[i] as "sh1"], BITS[i] as number];
+      putHarmonics(words[i] as Uint32Array, row, bits, this.coefficients[i] as Lookup, own, start);
+    });
+  }
+
+  /** The words of a palette, which is decoded once. */
+  private rowsOf(palette: Palette): readonly Uint32Array[] {
+    const known = rowsOfPalettes.get(palette);
+    if (known) return known;
+    const words = HARMONICS.slice(0, palette.degree).map(
+      (key) => new Uint32Array(palette.count * WORDS[key]),
+    );
+    palette.decode((harmonics, start) => this.putHarmonics(words, harmonics, start));
+    rowsOfPalettes.set(palette, words);
+    return words;
+  }
+
+  private prepare(header: Header, palette: Palette | null): void {
     this.header = header;
     const { scaleOrigin, scaleStep, colourOrigin, colourStep, shBits, opacityStep } = header;
     this.alpha = Uint8Array.from({ length: 256 }, (_, opacity) => Math.min(opacity * opacityStep, 255));
@@ -106,6 +125,7 @@ export class Packing implements Sink<Part> {
       const mask = 2 ** bits - 1;
       return new Lookup((value) => Math.round(Math.max(-most, Math.min(most, value * step * most))) & mask);
     });
+    this.rows = palette ? this.rowsOf(palette) : [];
   }
 
   private putOpacities(out: Uint8Array, block: Block, start: number, count: number): void {
@@ -173,6 +193,26 @@ export class Packing implements Sink<Part> {
         (angle << 24);
     }
   }
+}
+
+const rowsOfPalettes = new WeakMap<Palette, readonly Uint32Array[]>();
+
+/** Copies rows of a palette to words, degree by degree. */
+function putRows(
+  words: readonly Uint32Array[],
+  rows: readonly Uint32Array[],
+  entries: Int32Array,
+  start: number,
+  count: number,
+): void {
+  words.forEach((out, i) => {
+    const from = rows[i] as Uint32Array;
+    const row = WORDS[HARMONICS[i] as "sh1"];
+    for (let k = 0, at = row * start; k < count; k++) {
+      const first = row * (entries[k] as number);
+      for (let j = 0; j < row; j++) out[at++] = from[first + j] as number;
+    }
+  });
 }
 
 /** Adds coefficients of `bits` bits, r g b, coefficient after coefficient, to words that are 0. */

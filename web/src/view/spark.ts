@@ -4,7 +4,7 @@ import type { Encoding, Packed } from "../core/pick";
 import type { Box, Format, Handle, Manifest, Renderer, Viewpoint } from "../types";
 import { colorsOf } from "./colors";
 import { boundsOf, drawnCells, joinedBounds, touches } from "./culling";
-import { type Answer, Decoders } from "./decoding";
+import { type Answer, Decoders, type PaletteBytes } from "./decoding";
 import StreamWorker from "./decoding.worker?worker&inline";
 import { rootMatrix } from "./frame";
 import { blendOpacities } from "./opacity";
@@ -121,10 +121,11 @@ export class SparkLayer implements Renderer {
     bytes: Uint8Array,
     format: Format,
     below: readonly Uint8Array[] = [],
+    palette?: PaletteBytes,
   ): Promise<Increment> {
     const part =
       format === "stream"
-        ? await this.#decoders.decode(cell * LEVELS + level - below.length, [...below, bytes])
+        ? await this.#decoders.decode(cell * LEVELS + level - below.length, [...below, bytes], palette)
         : await decodePart(bytes, format);
     const bounds = boundsOf(part.splats, part.count, part.encoding);
     return { label, cell, level, count: part.count, part, bounds };

@@ -48,6 +48,38 @@ test("a stream that replaces those below needs nothing of theirs", async () => {
   expect(shown(w.streamer.state)).toEqual([1, 1]);
 });
 
+const GIVEN = { labels: 2, streams: true, cells: 2, replaces: [3], palette: 3000 };
+test.each([
+  ["ranges", {}],
+  ["a pack", { pack: true }],
+])("streams are decoded with the palette of their file, with %s", async (_name, more) => {
+  const w = await started("full", { ...GIVEN, ...more });
+  expect(shown(w.streamer.state)).toEqual([5, 5, 5, 5]);
+  await w.run({ mode: "base" });
+  await w.run({ mode: "full" });
+  expect(shown(w.streamer.state)).toEqual([5, 5, 5, 5]);
+  expect(w.streamer.state.message).toBe(null);
+});
+
+test("below the levels that need it no palette is asked for", async () => {
+  const w = await started("base", GIVEN);
+  expect(shown(w.streamer.state)).toEqual([1, 1, 1, 1]);
+  const bytes = w.manifest.labels.flatMap(({ cells }) => cells.map(({ levels }) => levels[0]?.bytes ?? 0));
+  const models = w.manifest.promises.fidelity?.bytes ?? 0;
+  expect(w.streamer.state.bytesLoaded).toBe(bytes.reduce((sum, one) => sum + one, models));
+});
+
+test("a palette that is damaged for good leaves the levels below", async () => {
+  const w = world({ ...GIVEN, labels: 1 });
+  const palette = w.manifest.labels[0]?.palette;
+  const content = w.network.files.get(palette?.uri ?? "");
+  if (!content) throw new Error("no palette");
+  content[7] = (content[7] as number) ^ 1;
+  await w.run({ mode: "full" });
+  expect(shown(w.streamer.state)).toEqual([2, 2]);
+  expect(w.streamer.state.message).toContain("damaged");
+});
+
 test("below it levels add up as ever", async () => {
   const w = await started("base", { labels: 1 });
   expect(shown(w.streamer.state)).toEqual([1]);

@@ -1,15 +1,16 @@
 /** Coded streams against those of the Python package. */
 
 import { describe, expect, test } from "vitest";
+import { Palette } from "../../src/core/palette";
 import { StreamDecoder } from "../../src/core/stream";
 import { Floats, type Gaussians } from "../floats";
 import { fuzz } from "../fuzz";
-import { bytesOf, type Golden, golden } from "../golden";
+import { bytesOf, fileOf, type Golden, golden, paletteBytesOf, paletteOf } from "../golden";
 import { seeded } from "../simulate";
 
 /** What a decoder finds in bytes that arrive in pieces. */
-function decoded(bytes: Uint8Array, piece = bytes.length || 1): Gaussians[] {
-  const decoder = new StreamDecoder(new Floats());
+function decoded(bytes: Uint8Array, palette: Palette | null, piece = bytes.length || 1): Gaussians[] {
+  const decoder = new StreamDecoder(new Floats(), palette);
   const levels: Gaussians[] = [];
   for (let at = 0; at < bytes.length; at += piece) levels.push(...decoder.push(bytes.slice(at, at + piece)));
   return levels;
@@ -40,7 +41,7 @@ function secondsOf(levels: readonly Gaussians[]): number[] {
 
 describe.each(golden)("$name", (one) => {
   test("is decoded to what Python decodes it to", () => {
-    const found = together(decoded(bytesOf(one)));
+    const found = together(decoded(bytesOf(one), paletteOf(one)));
     for (const [name, values] of Object.entries(one.gaussians)) {
       const mine = found[name as keyof typeof found];
       expect(mine?.length, name).toBe(values.length);
@@ -50,12 +51,13 @@ describe.each(golden)("$name", (one) => {
   });
 
   test.each([1, 7, 100])("is decoded as it arrives, %i bytes at a time", (piece) => {
-    expect(decoded(bytesOf(one), piece)).toEqual(decoded(bytesOf(one)));
+    const palette = paletteOf(one);
+    expect(decoded(bytesOf(one), palette, piece)).toEqual(decoded(bytesOf(one), palette));
   });
 
   test("gives a level as soon as its last byte is there", () => {
     const bytes = bytesOf(one);
-    const decoder = new StreamDecoder(new Floats());
+    const decoder = new StreamDecoder(new Floats(), paletteOf(one));
     let [at, size] = [0, 0];
     one.ends.forEach((end, level) => {
       expect(decoder.push(bytes.slice(at, end - 1))).toEqual([]);
@@ -68,7 +70,7 @@ describe.each(golden)("$name", (one) => {
   });
 
   test("refuses bytes after the last level", () => {
-    expect(() => decoded(Uint8Array.of(...bytesOf(one), 0))).toThrow("after the last level");
+    expect(() => decoded(Uint8Array.of(...bytesOf(one), 0), paletteOf(one))).toThrow("after the last level");
   });
 });
 
@@ -76,7 +78,8 @@ test.each([
   [0, 1, "not a sagesplat-stream"],
   [4, 2, "another version"],
   [4, 4, "another version"],
-  [5, 4, "unknown flags"],
+  [5, 8, "unknown flags"],
+  [5, 4, "impossible header"],
   [6, 4, "impossible header"],
   [7, 0, "impossible header"],
   [9, 9, "impossible header"],
@@ -84,7 +87,34 @@ test.each([
 ])("refuses a header with byte %i set to %i", (at, value, words) => {
   const bytes = bytesOf(golden[0] as Golden);
   bytes[at] = value;
-  expect(() => decoded(bytes)).toThrow(words);
+  expect(() => decoded(bytes, null)).toThrow(words);
+});
+
+const given = golden.filter(({ palette }) => palette);
+
+test.each([
+  [0, 1, "not a palette"],
+  [4, 2, "another version"],
+  [5, 0, "impossible header"],
+  [6, 9, "impossible header"],
+  [8, 0, "more rows than fit"],
+  [10, 2, "more rows than fit"],
+  [12, 1, "impossible header"],
+])("refuses a palette with byte %i set to %i", (at, value, words) => {
+  const bytes = paletteBytesOf(given[0] as Golden) as Uint8Array;
+  bytes[at] = value;
+  expect(() => new Palette(bytes)).toThrow(words);
+});
+
+test("a stream needs the palette of its file, with all rows that it names", () => {
+  const [one, other] = given as [Golden, Golden];
+  expect(() => decoded(bytesOf(one), null)).toThrow("no palette");
+  expect(() => decoded(bytesOf(one), paletteOf(other))).toThrow("a palette of other harmonics");
+  const short = Object.assign(new Palette(paletteBytesOf(one) as Uint8Array), { count: 1, decode: () => {} });
+  expect(() => decoded(bytesOf(one), short)).toThrow("a row that the palette does not have");
+  const bytes = paletteBytesOf(one) as Uint8Array;
+  bytes[8] = 1;
+  expect(() => new Palette(bytes).decode(() => {})).toThrow("damaged");
 });
 
 test("damaged bytes are errors or finite Gaussians", () => {
@@ -93,10 +123,18 @@ test("damaged bytes are errors or finite Gaussians", () => {
   let refused = 0;
   let finite = true;
   for (let i = 0; i < 1000; i++) {
-    const bytes = bytesOf(golden[i % golden.length] as Golden);
+    const one = golden[i % golden.length] as Golden;
+    const bytes = bytesOf(one);
     for (let k = random(3); k >= 0; k--) bytes[random(bytes.length)] = random(256);
     try {
-      const all = decoded(bytes).flatMap((g) => [g.means, g.quats, g.logScales, g.opacities, g.sh0, g.shN]);
+      const all = decoded(bytes, paletteOf(one)).flatMap((g) => [
+        g.means,
+        g.quats,
+        g.logScales,
+        g.opacities,
+        g.sh0,
+        g.shN,
+      ]);
       finite &&= all.every((values) => values.every(Number.isFinite));
     } catch (error) {
       if ((error as Error).constructor !== Error) throw error; // such as a RangeError of an array
@@ -108,7 +146,7 @@ test("damaged bytes are errors or finite Gaussians", () => {
 });
 
 test("no damage does more than a plain error, or takes more memory than the bytes may hold", () => {
-  const found = fuzz(golden.map(bytesOf), 24, { most: 1500 });
+  const found = fuzz(golden.map(fileOf), 24, { most: 1500 });
   expect(found.wrong).toEqual([]);
   expect(found.tried).toBe(1500);
   expect(Math.min(found.decoded, found.refused)).toBeGreaterThan(100);

@@ -2,7 +2,7 @@
 
 import { expect, test } from "vitest";
 import { type Answer, Decoders, type Job, Streams } from "../../src/view/decoding";
-import { bytesOf, type Golden, golden } from "../golden";
+import { bytesOf, type Golden, golden, paletteBytesOf } from "../golden";
 import { settled } from "../simulate";
 
 /** The ranges of levels with Gaussians, and how many each has; empty ones go with the next, or the last. */
@@ -47,15 +47,21 @@ function made() {
   return { decoders, worker, workers };
 }
 
+function paletteIn(one: Golden) {
+  const bytes = paletteBytesOf(one);
+  return bytes && { sha256: one.name, bytes };
+}
+
 const many = golden.filter(({ sizes }) => sizes.length > 1);
 
 test.each(many)("$name: each level goes on where the one before ended", async (one) => {
   const { decoders, worker } = made();
   const { increments, counts } = ranges(one);
   for (const [i, count] of counts.entries()) {
-    const part = await decoders.decode(7, increments.slice(0, i + 1));
+    const part = await decoders.decode(7, increments.slice(0, i + 1), paletteIn(one));
     expect(part.count).toBe(count);
     expect(worker().jobs.at(-1)).toMatchObject({ from: i, increments: { length: 1 } });
+    expect(worker().jobs.at(-1)?.palette).toEqual(i ? undefined : paletteIn(one));
   }
 });
 

@@ -4,7 +4,7 @@ import { describe, expect, test } from "vitest";
 import { StreamDecoder } from "../../src/core/stream";
 import { blendOpacities } from "../../src/view/opacity";
 import { ENCODING, Packing } from "../../src/view/packing";
-import { bytesOf, golden } from "../golden";
+import { bytesOf, golden, paletteOf } from "../golden";
 
 const cases = golden.filter(({ weights }) => weights);
 const alphas = (words: Uint32Array) => [...words].flatMap((word, i) => (i % 4 ? [] : word >>> 24));
@@ -12,7 +12,7 @@ const alphas = (words: Uint32Array) => [...words].flatMap((word, i) => (i % 4 ? 
 test("there are golden streams with two", () => expect(cases.length).toBeGreaterThan(1));
 
 describe.each(cases)("$name", (one) => {
-  const parts = new StreamDecoder(new Packing()).push(bytesOf(one));
+  const parts = new StreamDecoder(new Packing(), paletteOf(one)).push(bytesOf(one));
 
   /** What is drawn where a level is the newest one, of words with others besides. */
   function shown(level: number): number[] {

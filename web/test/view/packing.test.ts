@@ -6,7 +6,7 @@ import { BASES } from "../../src/core/columns";
 import { StreamDecoder } from "../../src/core/stream";
 import { STREAM_ENCODING as ENCODING, HARMONICS, Packing, WORDS } from "../../src/view/packing";
 import { Floats, type Gaussians } from "../floats";
-import { bytesOf, golden } from "../golden";
+import { bytesOf, golden, paletteOf } from "../golden";
 
 const ENCODERS = { sh1: utils.encodeSh1Rgb, sh2: utils.encodeSh2Rgb, sh3: utils.encodeSh3Rgb };
 
@@ -46,9 +46,14 @@ function fieldsOf(words: Uint32Array): number[] {
 }
 
 describe.each(golden)("$name", (one) => {
-  const [floats, parts] = [new StreamDecoder(new Floats()), new StreamDecoder(new Packing())].map((decoder) =>
-    decoder.push(bytesOf(one)),
-  ) as [ReturnType<StreamDecoder<Gaussians>["push"]>, ReturnType<Packing["begin"]>[]];
+  const palette = paletteOf(one);
+  const [floats, parts] = [
+    new StreamDecoder(new Floats(), palette),
+    new StreamDecoder(new Packing(), palette),
+  ].map((decoder) => decoder.push(bytesOf(one))) as [
+    ReturnType<StreamDecoder<Gaussians>["push"]>,
+    ReturnType<Packing["begin"]>[],
+  ];
 
   test("is packed as Spark packs it", () => {
     floats.forEach((g, level) => {
