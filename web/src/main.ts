@@ -36,9 +36,9 @@ async function begin(): Promise<void> {
 async function showOnline(app: HTMLElement, options: Options): Promise<void> {
   const base = bundleUrl(options.bundle, location.href);
   const online: Fetch = (url, init) => fetch(url, init);
-  const name = options.bundle ? null : packNamed(document);
-  if (!name) return show(app, { base, fetch: online }, options);
-  const pack = inAdvance(online, new URL(name, base).href);
+  const named = options.bundle ? null : packNamed(document);
+  if (!named) return show(app, { base, fetch: online }, options);
+  const pack = inAdvance(online, new URL(named.uri, base).href, named.bytes);
   try {
     await show(app, { base, fetch: pack.fetch }, options);
   } finally {
@@ -68,10 +68,11 @@ async function show(app: HTMLElement, source: Source, options: Options): Promise
   removePosterWhenDrawn(viewer, canvas);
 }
 
-/** The pack that the page of a bundle names, so that it is asked for together with the manifest. */
-function packNamed(page: ParentNode): string | null {
-  const name = page.querySelector<HTMLMetaElement>('meta[name="pack"]')?.content ?? "";
-  return /^\w[\w-]*\.pack$/.test(name) ? name : null;
+/** The pack that the page of a bundle names, and what every plan wants of it: asked for together with the manifest. */
+function packNamed(page: ParentNode): { uri: string; bytes: number } | null {
+  const content = page.querySelector<HTMLMetaElement>('meta[name="pack"]')?.content ?? "";
+  const [, uri, bytes] = /^(\w[\w-]*\.pack) ([1-9]\d*)$/.exec(content) ?? [];
+  return uri ? { uri, bytes: Number(bytes) } : null;
 }
 
 /** Removes the poster when the scene is drawn, or at the first input. */

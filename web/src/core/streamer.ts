@@ -19,7 +19,7 @@ import { normalised, same } from "./inputs";
 import { poll } from "./live";
 import { parsePromises } from "./manifest";
 import { inOrder } from "./order";
-import { filesOf } from "./pack";
+import { Pack } from "./pack";
 import { makePlan, type Plan } from "./planner";
 import { screenOf } from "./quality";
 import { type Drawn, type Entry, entriesOf, exchange, gpuBytesOf, Hidden, settle } from "./residency";
@@ -116,8 +116,7 @@ export class Streamer {
   start(): void {
     if (this.phase !== "new") return;
     this.phase = "running";
-    const { pack } = this.content;
-    if (pack) this.downloads.openPack(pack, filesOf(this.content));
+    if (this.content.pack) this.downloads.openPack(new Pack(this.content));
     this.plan();
     if (this.content.live) this.follow();
   }
@@ -206,9 +205,14 @@ export class Streamer {
     this.work();
   }
 
-  /** Sets the levels to go for: cells out of sight are raised once everything in sight is drawn as planned. */
+  /**
+   * Sets the levels to go for: cells out of sight are raised once everything in sight is drawn as planned, unless
+   * the server would send all of their levels.
+   */
   private aim(): void {
-    const isDrawn = this.entries.every(({ sight, shown, planned }) => !sight.visible || shown >= planned);
+    const canRaise = this.downloads.sendsRanges !== false;
+    const isDrawn =
+      canRaise && this.entries.every(({ sight, shown, planned }) => !sight.visible || shown >= planned);
     for (const e of this.entries) {
       const most = isDrawn ? e.around : Math.min(e.shown, e.around);
       e.wanted = e.sight.visible ? e.planned : Math.max(e.planned, most);
@@ -240,12 +244,11 @@ export class Streamer {
     this.hidden.shrink(this.settings.cacheBytes);
     this.decodeMore();
     const promises = this.missingPromises();
-    const queue = inOrder(this.entries, this.downloads, promises, this.promisesCanWait());
+    const models = this.isUndecided(promises) ? "awaited" : this.promisesCanWait() ? "last" : "first";
+    const queue = inOrder(this.entries, this.downloads, promises, models);
     this.pending = queue.length;
     this.downloads.keepOnly(this.wantedKeys);
-    const undecided =
-      this.settings.mode !== "base" && promises.some((file) => !this.downloads.isBackingOff(file));
-    this.downloads.fill(queue, undecided);
+    this.downloads.fill(queue);
     const took = this.clock.now() - begun;
     if (took > QUICK_MS) this.nextWork = begun + (1 + PAUSE) * took;
     this.changed();
@@ -260,13 +263,21 @@ export class Streamer {
     }
   }
 
+  /** Whether missing viewpoint models will change the plan. */
+  private isUndecided(promises: readonly File[]): boolean {
+    return this.dependsOnModels && promises.some((file) => !this.downloads.isBackingOff(file));
+  }
+
+  private get dependsOnModels(): boolean {
+    const { mode } = this.settings;
+    return this.planned !== "ok" || (mode !== "full" && mode !== "base");
+  }
+
   /** Whether viewpoint models can wait: the plan does not depend on them, and they would delay a small pack. */
   private promisesCanWait(): boolean {
-    const { mode } = this.settings;
     const { promises, content } = this;
     const { pack } = content;
-    if (!this.downloads.hasPack || this.planned !== "ok" || (mode !== "full" && mode !== "base"))
-      return false;
+    if (!this.downloads.hasPack || this.dependsOnModels) return false;
     return (promises?.bytes ?? 0) > DELAYING_SHARE * (pack?.bytes ?? 0);
   }
 
