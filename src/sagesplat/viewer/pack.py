@@ -2,10 +2,10 @@
 
 It is a concatenation of increments, in the order of their benefit for the first view: level 1 of all cells,
 those in sight first, which the page asks for together with the manifest; then the upgrades by which
-categories reach the target, by gain of expected quality x pixel share per byte. Levels of a cell must come in order, so
-an increment counts with the slope of the concave hull of quality over bytes. The viewer orders by the same
-gains (web/src/core/order.ts), and asks for ranges of the pack. A server without ranges sends all of it: so
-nothing is in it that the first view does not need.
+categories reach the target, by gain of expected quality x pixel share per byte. Levels of a cell must come
+in order, so an increment counts with the slope of the concave hull of quality over bytes. The viewer orders
+by the same gains (web/src/core/order.ts), and asks for ranges of the pack. A server without ranges sends
+all of it: so nothing is in it that the first view does not need.
 
 Where the first view needs a level that replaces those below, the ones between the first and that are left
 out: nobody is to download what is thrown away at once.
