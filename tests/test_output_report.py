@@ -239,7 +239,7 @@ def test_the_first_page_leads_with_fidelity(tmp_path):
     words = " ".join(Page(write_report(tmp_path, data)).text.split())
     first = words[: words.index("What each category gets")]
     assert (
-        f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB of {full / 1e6:.2f} MB looks like the full model" in first
+        f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB of {full / 1e6:.2f} MB keep fidelity {plan.target:g}" in first
     )
     assert "Fidelity ≥ 0.95 in every category for 95 % of viewpoints" in first
     words_of_plan = words[words.index("What each category gets") : words.index("Bars: length")]
@@ -289,7 +289,7 @@ def test_what_a_newcomer_wants_to_know_comes_first(whole):
     words = " ".join(Page(path).text.split())
     first = words[words.index("a <scene>") : words.index("What to do next")]
     for said in (
-        "looks like the full model", f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB to send, of",
+        "keep fidelity", f"{(plan.transfer_bytes or 0) / 1e6:.2f} MB to send, of",
         "0.955 fidelity at 2 unseen viewpoints", "SSIM 0.700 on unseen photos",
         "of 6 measurements at unseen viewpoints reach 0.95", "sagesplat view '/runs/a place'",
         "sagesplat view --lan '/runs/a place'",

@@ -2,6 +2,7 @@ import { inAdvance } from "./core/advance";
 import type { Fetch } from "./core/download";
 import { bundleUrl, type Embed, linkTo, type Options, parseOptions } from "./embed";
 import { bytesFrom, type Source, sourceInside } from "./inside";
+import { formatName } from "./ui/format";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
 import { colorsOf } from "./view/colors";
@@ -51,7 +52,7 @@ async function show(app: HTMLElement, source: Source, options: Options): Promise
   const { canvas } = viewer.stage;
   canvas.id = "view";
   app.removeAttribute("hidden");
-  document.title = `${viewer.manifest.name} · sagesplat`;
+  document.title = `${formatName(viewer.manifest.name)} · sagesplat`;
   hideNotice();
   if (options.ui) buildPage(app, viewer);
   window.sagesplat = Object.assign(window.sagesplat, embed(viewer));

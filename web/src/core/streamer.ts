@@ -4,6 +4,7 @@ import type {
   Handle,
   Level,
   Manifest,
+  Promises,
   Quality,
   Renderer,
   Screens,
@@ -110,6 +111,11 @@ export class Streamer {
     if (this.known?.bytesLoaded !== this.downloads.received) this.known = null;
     this.known ??= this.describe();
     return this.known;
+  }
+
+  /** The viewpoint models that are planned with, once they are there. */
+  get promisesHere(): Promises | null {
+    return this.models.promises;
   }
 
   /** Starts loading, for the bundle's start view until `update` is called. */

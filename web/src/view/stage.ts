@@ -14,6 +14,7 @@ import { orientation, type Rig } from "./motion";
 import { SparkLayer } from "./spark";
 
 const FOV = 60; // degrees, of the window's shorter side, unless a photo's lens is set
+const HIGHEST = 1.2; // tangent of half of a vertical field of view
 const NEAR = 0.03; // metres
 const LONGEST_HOLD = 600; // ms that a picture stays for want of the next one
 const FAR = 1e5; // beyond the sky of a large scene: up to 100 scene extents away
@@ -185,9 +186,12 @@ export class Stage {
     this.invalidate();
   }
 
+  /** In a tall window no more is seen above and below than the photos saw: there is nothing beyond. */
   #usual(aspect: number): number {
     const half = Math.tan((FOV * Math.PI) / 360);
-    return 2 * Math.atan(aspect < 1 ? Math.min(half / aspect, 1.2) : half);
+    const photos = this.manifest.cameras.map(({ fovY }) => Math.tan(fovY / 2));
+    const most = photos.length ? Math.max(half, ...photos) : HIGHEST;
+    return 2 * Math.atan(aspect < 1 ? Math.min(half / aspect, most, HIGHEST) : half);
   }
 }
 
