@@ -191,8 +191,10 @@ def promised(promised_bundle: Path) -> Iterator[str]:
 
 
 @contextmanager
-def serve(folder: Path, instead: Mapping[str, bytes | None] | None = None) -> Iterator[str]:
-    """Any static web server: no ranges, the strict policy. `instead`: other contents; None: 404."""
+def serve(
+    folder: Path, instead: Mapping[str, bytes | None] | None = None, ranges: bool = False
+) -> Iterator[str]:
+    """Any static web server, with the strict policy. `instead`: other contents; None: 404."""
 
     class Handler(http.server.SimpleHTTPRequestHandler):
         extensions_map = {**http.server.SimpleHTTPRequestHandler.extensions_map, ".js": "text/javascript"}  # noqa: RUF012
@@ -209,6 +211,15 @@ def serve(folder: Path, instead: Mapping[str, bytes | None] | None = None) -> It
                 self.send_header("Content-Length", str(len(other)))
                 self.end_headers()
                 self.wfile.write(other)
+            elif ranges and (asked := re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))):
+                start, end = map(int, asked.groups())
+                content = (folder / self.path.lstrip("/").partition("?")[0]).read_bytes()
+                part = content[start : end + 1]
+                self.send_response(206)
+                self.send_header("Content-Range", f"bytes {start}-{start + len(part) - 1}/{len(content)}")
+                self.send_header("Content-Length", str(len(part)))
+                self.end_headers()
+                self.wfile.write(part)
             else:
                 super().do_GET()
 
@@ -519,6 +530,80 @@ def test_fidelity_is_promised_and_the_photos_are_a_choice(promised: str, browser
         page.get_by_role("combobox", name="Compared with").select_option("fidelity")
         opened.wait_for("sagesplat.state().labels.every((l) => l.promised === 0.95)")
         assert page.evaluate("sagesplat.settings().target") == 0.95
+        assert opened.complaints == []
+
+
+@pytest.mark.parametrize("ranges", [True, False])
+def test_on_an_unlimited_link_no_more_comes_than_the_plan(
+    promised_bundle: Path, browser: Any, ranges: bool
+) -> None:
+    with (
+        serve(promised_bundle, ranges=ranges) as url,
+        open_page(f"{url}?target=0.7", browser=browser) as opened,
+    ):
+        ready(opened)
+        promises(opened)
+        opened.page.evaluate(FRAMES, 10)
+        promises(opened)
+        shown = opened.page.evaluate("sagesplat.state().bytesShown")
+        came = opened.page.evaluate(
+            "performance.getEntriesByType('resource').filter((r) => /chunks|pack$/.test(r.name))"
+            ".reduce((sum, r) => sum + r.encodedBodySize, 0)"
+        )
+        whole = json.loads((promised_bundle / "manifest.json").read_text())["totals"]["bytes"]
+        assert shown < 0.8 * whole
+        assert shown <= came <= (1.1 if ranges else 2) * shown
+        assert opened.complaints == []
+
+
+# windows
+
+WINDOWS = ((1400, 900), (700, 450), (500, 400), (390, 844), (360, 640), (844, 390), (1000, 600))
+BOXES = """[...document.querySelectorAll('.title, .toolbar, .panel, .editor')]
+    .filter((e) => e.checkVisibility()).map((e) => [e.className.split(' ')[0], e.getBoundingClientRect()])
+    .map(([name, { left, top, right, bottom }]) => [name, left, top, right, bottom])"""
+
+
+def test_nothing_overlaps_in_any_window_and_a_phone_shows_the_scene(site: str, browser: Any) -> None:
+    script = "localStorage.setItem('sagesplat-welcome', 'seen')"
+    with open_page(site, WINDOWS[0], browser=browser, script=script) as opened:
+        ready(opened)
+        page = opened.page
+        for state in ("as it opens", "panel closed or open", "labels edited"):
+            if state == "panel closed or open":
+                page.keyboard.press("p")
+            if state == "labels edited":
+                page.keyboard.press("l")
+                opened.wait_for("document.querySelector('.editor')?.checkVisibility()")
+            for width, height in WINDOWS:  # each after a resize
+                page.set_viewport_size({"width": width, "height": height})
+                boxes = page.evaluate(BOXES)
+                where = f"{state}, {width} x {height}: {boxes}"
+                for name, left, top, right, bottom in boxes:
+                    assert min(left, top, width - right, height + 1 - bottom) >= 0, where
+                    if width <= 640 and name in ("panel", "editor"):
+                        assert bottom - top <= 0.4 * height + 1, where
+                for i, (_, *one) in enumerate(boxes):
+                    for _, *two in boxes[:i]:
+                        apart = one[0] >= two[2] or two[0] >= one[2] or one[1] >= two[3] or two[1] >= one[3]
+                        assert apart, where
+        assert opened.complaints == []
+
+
+@pytest.mark.slow
+def test_nobody_is_lost_in_the_dark_unless_he_wants_to(site: str, browser: Any) -> None:
+    away = "Math.hypot(...sagesplat.pose().position.map((v, i) => v - sagesplat.cameras[0].position[i]))"
+    back = """for (let i = 0; i < 60; i++) document.getElementById('view')
+        .dispatchEvent(new WheelEvent('wheel', { deltaY: 100, cancelable: true }))"""
+    with open_page(site, (900, 640), browser=browser) as opened:
+        ready(opened)
+        extent = json.loads(opened.page.request.get(f"{site}manifest.json").text())["frame"]["extent"]
+        opened.page.evaluate(back)
+        held = opened.page.evaluate(away)
+        assert held < 2.5 * extent
+        opened.page.get_by_role("button", name="Move freely").click()
+        opened.page.evaluate(back)
+        assert opened.page.evaluate(away) > 10 * held
         assert opened.complaints == []
 
 

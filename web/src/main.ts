@@ -81,6 +81,11 @@ function removePosterWhenDrawn(viewer: Viewer, canvas: HTMLCanvasElement): void 
   const poster = document.getElementById("poster");
   if (!poster) return;
   canvas.after(poster); // above the scene, below the panel
+  if (poster instanceof HTMLImageElement)
+    void meanOf(poster).then(
+      (mean) => viewer.setMean(mean),
+      () => {},
+    );
   const down = () => {
     stop();
     poster.remove();
@@ -92,6 +97,17 @@ function removePosterWhenDrawn(viewer: Viewer, canvas: HTMLCanvasElement): void 
     canvas.addEventListener(event, down, { once: true });
   }
   if (viewer.photo >= 0) down(); // the poster shows another view
+}
+
+/** The mean colour of a picture, 0 to 255. */
+async function meanOf(picture: HTMLImageElement): Promise<readonly number[]> {
+  await picture.decode();
+  const canvas = document.createElement("canvas");
+  const context = canvas.getContext("2d");
+  [canvas.width, canvas.height] = [16, 16];
+  context?.drawImage(picture, 0, 0, 16, 16);
+  const pixels = [...(context?.getImageData(0, 0, 16, 16).data ?? [])];
+  return [0, 1, 2].map((i) => pixels.reduce((sum, value, k) => sum + (k % 4 === i ? value / 256 : 0), 0));
 }
 
 /** Reloads a live bundle when training is finished: it then has levels. */

@@ -68,9 +68,10 @@ export function formatLook(quality: Quality, target: number): string {
   if (quality !== "fidelity") return "";
   const looks: readonly (readonly [number, string])[] = [
     [0.975, "hardly to be told from the full scene"],
-    [0.93, "the finest texture is a little softer"],
-    [0.85, "leaves and stone are softer, shapes stay"],
-    [0.75, "texture is smoothed away, edges are soft"],
+    [0.93, "differences show only side by side"],
+    [0.85, "the finest texture is a little softer"],
+    [0.75, "leaves and stone are softer, shapes stay"],
+    [0.6, "texture is smoothed away, edges are soft"],
     [0, "shapes and colours only"],
   ];
   return looks.find(([from]) => target >= from)?.[1] ?? "";

@@ -8,6 +8,7 @@ import { forward, type Rig } from "./motion";
 const REACH = 0.25; // of the scene's extent: how far from a known viewpoint one may be
 const REACH_OF_PHOTOS = 1; // the same while only those of photos are known
 const APPROACH = 0.3; // of the way to the nearest surface that one step closer may take
+const CLEARANCE = 0.05; // of the extent: what stays between the camera and a surface
 const CONE = 0.7; // cosine of the angle from the view's direction within which surfaces are near
 const HALVINGS = 12;
 
@@ -16,6 +17,7 @@ export class Bounds {
   isOn = true;
   private viewpoints: readonly Vector3[]; // in the world, metres
   private reach: number;
+  private readonly clearance: number;
   private readonly surface: readonly { readonly at: Vector3; readonly radius: number }[];
 
   /** @param root - from the bundle's frame to the world */
@@ -25,6 +27,7 @@ export class Bounds {
   ) {
     const { frame, cameras, start, labels } = manifest;
     this.reach = REACH_OF_PHOTOS * frame.extent * frame.metersPerUnit;
+    this.clearance = CLEARANCE * frame.extent * frame.metersPerUnit;
     this.viewpoints = [start, ...cameras].map(({ position }) => this.inWorld(position));
     this.surface = labels.flatMap(({ cells }) =>
       cells.flatMap(({ bounds, points, area }) => {
@@ -81,7 +84,7 @@ export class Bounds {
       const distance = to.length();
       if (to.dot(ahead) > CONE * distance) nearest = Math.min(nearest, Math.max(distance - radius, 0));
     }
-    return APPROACH * nearest;
+    return APPROACH * Math.max(nearest - this.clearance, 0);
   }
 
   private away(position: Vector3): number {

@@ -28,8 +28,12 @@ export class Stage {
   full: SparkLayer | null = null;
   split = 0.5; // share of the width that shows the full scene
   needsFrame = true;
+  /** What is behind all that is drawn while something in sight is missing: the scene's mean colour. */
+  mean: Color | null = null;
+  isIncomplete = false;
   #photo: Camera | null = null;
   #fovY: number | null = null;
+  readonly #background: Color; // that the scene was trained with
   #heldSince = Number.NaN; // ms
 
   /** Throws without WebGL 2. */
@@ -38,7 +42,7 @@ export class Stage {
     readonly manifest: Manifest,
   ) {
     this.renderer = new WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
-    this.renderer.setClearColor(background(manifest), 1);
+    this.#background = background(manifest);
     this.root = rootMatrix(manifest.frame);
     this.layer = this.newLayer();
   }
@@ -133,6 +137,7 @@ export class Stage {
   draw(mayHold = false): boolean {
     this.needsFrame = false;
     const { renderer, camera } = this;
+    renderer.setClearColor((this.isIncomplete && this.mean) || this.#background, 1);
     const view = this.viewpoint();
     for (const layer of [this.layer, this.full]) layer?.cull(view);
     if (this.#holds(view, mayHold && !renderer.xr.isPresenting)) return false;

@@ -1,4 +1,4 @@
-import { Vector3 } from "three";
+import { Color, SRGBColorSpace, Vector3 } from "three";
 import { qualitiesOf } from "../core/manifest";
 import { Streamer } from "../core/streamer";
 import type { Embed, Options, Sample } from "../embed";
@@ -160,6 +160,12 @@ export class Viewer {
     }
   }
 
+  /** The scene's mean colour, 0 to 255: what is behind the picture while something in sight is missing. */
+  setMean([red = 0, green = 0, blue = 0]: readonly number[]): void {
+    this.stage.mean = new Color().setRGB(red / 255, green / 255, blue / 255, SRGBColorSpace);
+    this.stage.invalidate();
+  }
+
   pose(): Pose {
     return this.stage.pose();
   }
@@ -236,6 +242,9 @@ export class Viewer {
       this.frameMs = Number.NaN;
       return;
     }
+    stage.isIncomplete = this.state.labels.some(({ cells }) =>
+      cells.some((cell) => cell.visible && !cell.shown),
+    );
     const isDrawn = stage.draw(true);
     this.streamer.update(stage.viewpoint());
     if (!isDrawn) return;
