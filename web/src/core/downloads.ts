@@ -28,6 +28,7 @@ const LEAST_REQUEST_BYTES = 8192; // bytes of ranges that one request brings at 
 
 export interface DownloadsOptions extends Omit<Link, "received" | "answered"> {
   readonly keepBytes: number; // cache of downloaded files
+  readonly cache?: LruCache | undefined; // instead: of another's, who has the same bundle
   readonly changed: () => void; // called when a file arrived, failed or may be retried
   readonly maxDownloads?: number;
 }
@@ -47,13 +48,13 @@ export class Downloads {
   sendsRanges: boolean | null = null;
   private readonly arrived = new Map<string, Uint8Array>(); // arrived files, until they are taken
   private readonly failures = new Map<string, Failure>();
-  private readonly cache: LruCache;
+  readonly cache: LruCache;
   private readonly link: Link;
   private closed = false;
 
   constructor(private readonly options: DownloadsOptions) {
     this.bandwidth = new Bandwidth(options.clock);
-    this.cache = new LruCache(options.keepBytes);
+    this.cache = options.cache ?? new LruCache(options.keepBytes);
     const received = (bytes: number) => {
       this.received += bytes;
       this.bandwidth.count(bytes);
@@ -180,7 +181,7 @@ export class Downloads {
     for (const load of this.loads.all) this.loads.drop(load);
     this.pauseBandwidth();
     this.arrived.clear();
-    this.cache.clear();
+    if (!this.options.cache) this.cache.clear();
   }
 
   /** Number of concurrent downloads: many for small files, to fill the link; more would only weaken the order. */

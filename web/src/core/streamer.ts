@@ -36,6 +36,7 @@ export interface StreamerOptions {
   readonly now?: () => number; // ms, instead of the clock's
   readonly digest?: Digest;
   readonly keepBytes?: number; // cache of downloaded files
+  readonly beside?: Streamer; // one of the same bundle: what it has fetched is not fetched again
   readonly downloads?: number; // concurrent downloads, at most
 }
 
@@ -94,6 +95,7 @@ export class Streamer {
       clock: this.clock,
       digest: this.digest,
       keepBytes: options.keepBytes ?? FILE_CACHE_BYTES,
+      cache: options.beside?.downloads.cache,
       changed: () => this.arrived(),
       ...(options.downloads && { maxDownloads: options.downloads }),
     });
@@ -122,7 +124,7 @@ export class Streamer {
   start(): void {
     if (this.phase !== "new") return;
     this.phase = "running";
-    if (this.content.pack) this.downloads.openPack(new Pack(this.content));
+    if (this.content.pack && !this.options.beside) this.downloads.openPack(new Pack(this.content));
     this.plan();
     if (this.content.live) this.follow();
   }

@@ -70,7 +70,7 @@ export class Viewer {
       stop();
       this.bounds.know(promisesHere, manifest.frame);
     });
-    this.compare = new Compare(this.stage, manifest, source, () => this.settings);
+    this.compare = new Compare(this.stage, manifest, source, this.streamer, () => this.settings);
     this.headset = new Headset(
       this.stage,
       () => this.settings.budget.count,

@@ -89,6 +89,23 @@ test("a server without ranges sends the pack once, and is asked for no more than
   expect(w.streamer.state.bytesLoaded).toBe((w.manifest.pack?.bytes ?? 0) + models(w));
 });
 
+test("who is beside another fetches what that one lacks, once, and no pack", async () => {
+  const { w } = made({ levels: 8, streams: true });
+  await w.run({ mode: "target", target: 0.7 });
+  const { bytesLoaded, bytesShown } = w.streamer.state;
+  const asked = w.network.asked.length;
+  for (let times = 0; times < 2; times++) {
+    const other = world({}, { manifest: w.manifest, beside: w.streamer }, w);
+    await other.run({ mode: "full" });
+    expect(shown(other.streamer.state)).toEqual([8, 8, 8]);
+    const more = w.manifest.totals.bytes - bytesShown;
+    expect(other.streamer.state.bytesLoaded - models(w)).toBeLessThanOrEqual(times ? 0 : more);
+    other.streamer.dispose();
+  }
+  expect(w.network.asked.slice(asked)).not.toContain(PACK);
+  expect(w.streamer.state.bytesLoaded).toBe(bytesLoaded);
+});
+
 test("a viewer with a small budget loads little more than that", async () => {
   const { w } = made({ labels: 4, levels: 8 });
   const bytes = w.manifest.totals.bytes / 4;
