@@ -191,8 +191,10 @@ def promised(promised_bundle: Path) -> Iterator[str]:
 
 
 @contextmanager
-def serve(folder: Path, instead: Mapping[str, bytes | None] | None = None) -> Iterator[str]:
-    """Any static web server: no ranges, the strict policy. `instead`: other contents; None: 404."""
+def serve(
+    folder: Path, instead: Mapping[str, bytes | None] | None = None, ranges: bool = False
+) -> Iterator[str]:
+    """Any static web server, with the strict policy. `instead`: other contents; None: 404."""
 
     class Handler(http.server.SimpleHTTPRequestHandler):
         extensions_map = {**http.server.SimpleHTTPRequestHandler.extensions_map, ".js": "text/javascript"}  # noqa: RUF012
@@ -209,6 +211,15 @@ def serve(folder: Path, instead: Mapping[str, bytes | None] | None = None) -> It
                 self.send_header("Content-Length", str(len(other)))
                 self.end_headers()
                 self.wfile.write(other)
+            elif ranges and (asked := re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))):
+                start, end = map(int, asked.groups())
+                content = (folder / self.path.lstrip("/").partition("?")[0]).read_bytes()
+                part = content[start : end + 1]
+                self.send_response(206)
+                self.send_header("Content-Range", f"bytes {start}-{start + len(part) - 1}/{len(content)}")
+                self.send_header("Content-Length", str(len(part)))
+                self.end_headers()
+                self.wfile.write(part)
             else:
                 super().do_GET()
 
@@ -467,8 +478,9 @@ def test_the_first_minute(promised: str, browser: Any, size: tuple[int, int], sc
         ready(opened, BASE)
         page = opened.page
         opened.wait_for("document.querySelector('.summary').textContent.includes('fidelity')")
-        assert re.fullmatch(r"\S+ k?B of \S+ k?B · fidelity ≥ [01]\.\d\d", page.inner_text(".summary"))
-        assert page.inner_text(".title h1") == "three walls"
+        said = r"\S+ k?B of \S+ k?B shown, \S+ k?B fetched · fidelity ≥ [01]\.\d\d"
+        assert re.fullmatch(said, page.inner_text(".summary"))
+        assert page.inner_text(".title h1") == "Three walls"
         assert ("pinch" if phone else "scroll") in page.inner_text(".welcome")
         assert page.is_visible("input[aria-label='Keep quality at']")
         assert wrong_with(page) == []
@@ -522,6 +534,77 @@ def test_fidelity_is_promised_and_the_photos_are_a_choice(promised: str, browser
         assert opened.complaints == []
 
 
+def test_on_an_unlimited_link_no_more_comes_than_the_plan(promised_bundle: Path, browser: Any) -> None:
+    with (
+        serve(promised_bundle, ranges=True) as url,
+        open_page(f"{url}?target=0.7", browser=browser) as opened,
+    ):
+        ready(opened)
+        promises(opened)
+        opened.page.evaluate(FRAMES, 10)
+        promises(opened)
+        shown = opened.page.evaluate("sagesplat.state().bytesShown")
+        came = opened.page.evaluate(
+            "performance.getEntriesByType('resource').filter((r) => /chunks|pack$/.test(r.name))"
+            ".reduce((sum, r) => sum + r.encodedBodySize, 0)"
+        )
+        whole = json.loads((promised_bundle / "manifest.json").read_text())["totals"]["bytes"]
+        assert shown < 0.8 * whole
+        assert shown <= came <= 1.1 * shown
+        assert opened.complaints == []
+
+
+# windows
+
+WINDOWS = ((1400, 900), (700, 450), (500, 400), (390, 844), (360, 640), (844, 390), (1000, 600))
+BOXES = """[...document.querySelectorAll('.title, .toolbar, .panel, .editor')]
+    .filter((e) => e.checkVisibility()).map((e) => [e.className.split(' ')[0], e.getBoundingClientRect()])
+    .map(([name, { left, top, right, bottom }]) => [name, left, top, right, bottom])"""
+
+
+def test_nothing_overlaps_in_any_window_and_a_phone_shows_the_scene(site: str, browser: Any) -> None:
+    script = "localStorage.setItem('sagesplat-welcome', 'seen')"
+    with open_page(site, WINDOWS[0], browser=browser, script=script) as opened:
+        ready(opened)
+        page = opened.page
+        for state in ("as it opens", "panel closed or open", "labels edited"):
+            if state == "panel closed or open":
+                page.keyboard.press("p")
+            if state == "labels edited":
+                page.keyboard.press("l")
+                opened.wait_for("document.querySelector('.editor')?.checkVisibility()")
+            for width, height in WINDOWS:  # each after a resize
+                page.set_viewport_size({"width": width, "height": height})
+                boxes = page.evaluate(BOXES)
+                where = f"{state}, {width} x {height}: {boxes}"
+                for name, left, top, right, bottom in boxes:
+                    assert min(left, top, width - right, height + 1 - bottom) >= 0, where
+                    if width <= 640 and name in ("panel", "editor"):
+                        assert bottom - top <= 0.4 * height + 1, where
+                for i, (_, *one) in enumerate(boxes):
+                    for _, *two in boxes[:i]:
+                        apart = one[0] >= two[2] or two[0] >= one[2] or one[1] >= two[3] or two[1] >= one[3]
+                        assert apart, where
+        assert opened.complaints == []
+
+
+@pytest.mark.slow
+def test_nobody_is_lost_in_the_dark_unless_he_wants_to(site: str, browser: Any) -> None:
+    away = "Math.hypot(...sagesplat.pose().position.map((v, i) => v - sagesplat.cameras[0].position[i]))"
+    back = """for (let i = 0; i < 60; i++) document.getElementById('view')
+        .dispatchEvent(new WheelEvent('wheel', { deltaY: 100, cancelable: true }))"""
+    with open_page(site, (900, 640), browser=browser) as opened:
+        ready(opened)
+        extent = json.loads(opened.page.request.get(f"{site}manifest.json").text())["frame"]["extent"]
+        opened.page.evaluate(back)
+        held = opened.page.evaluate(away)
+        assert held < 2.5 * extent
+        opened.page.get_by_role("button", name="Move freely").click()
+        opened.page.evaluate(back)
+        assert opened.page.evaluate(away) > 10 * held
+        assert opened.complaints == []
+
+
 @pytest.mark.slow
 def test_promises_are_for_screens_and_a_window_that_changes_is_another(promised: str, browser: Any) -> None:
     def here(shorter: float, tan: float) -> float:
@@ -539,8 +622,11 @@ def test_promises_are_for_screens_and_a_window_that_changes_is_another(promised:
         opened.wait_for(f'{said} === "{known}; compared as averaged down to {averaged} px"')
         for width, height in ((900, 400), (360, 640)):  # the second as on a phone that was turned
             opened.page.set_viewport_size({"width": width, "height": height})
-            here(min(width, height), usual)
-            opened.wait_for(f'{said} === "{known}"')
+            # in a tall window no more is seen above and below than by the photos
+            seen = usual if width > height else max(usual, camera().height / 2 / camera().focal)
+            screen = here(height, seen)
+            more = f"; compared as averaged down to {round(height * 2 / screen)} px" if screen > 2 else ""
+            opened.wait_for(f'{said} === "{known}{more}"')
         opened.page.evaluate("sagesplat.setPose({ ...sagesplat.pose(), fovY: 0.5 })")
         here(640, np.tan(0.25))
         assert opened.complaints == []

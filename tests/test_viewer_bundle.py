@@ -364,7 +364,8 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
     assert manifest["totals"]["bytes"] == written.chunks == total
     assert manifest["totals"]["count"] == 39
     order = packed_parts(out)
-    assert sorted(order) == [[cell["id"], k + 1] for cell in cells for k in range(len(cell["levels"]))]
+    listed = [[cell["id"], k + 1] for cell in cells for k in range(len(cell["levels"]))]
+    assert [one for one in listed if one in order] == sorted(order)
     assert sorted(order[:4]) == [[cell, 1] for cell in range(4)]  # the smallest of everything
     assert written.manifest == (out / "manifest.json").stat().st_size
     assert written.total == sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
@@ -414,7 +415,7 @@ def packed_parts(out: Path) -> list[list[int]]:
         part = content[at : at + entry["bytes"]]
         assert hashlib.sha256(part).hexdigest() == entry["sha256"]
         at += len(part)
-    assert at == len(content) == pack["bytes"] == manifest["totals"]["bytes"]
+    assert at == len(content) == pack["bytes"]
     assert pack["sha256"] == hashlib.sha256(content).hexdigest()
     assert pack["uri"] == f"scene-{pack['sha256'][:12]}.pack"
     return pack["order"]
@@ -426,9 +427,10 @@ def test_the_page_names_the_pack(tmp_path, contents, viewer) -> None:
     for _ in range(2):
         write_bundle(out, contents, viewer)
         pack = json.loads((out / "manifest.json").read_text())["pack"]
-        assert (
-            out / "index.html"
-        ).read_text() == f'<head><meta name="pack" content="{pack["uri"]}" /></head>'
+        levels = {c["id"]: c["levels"] for label in manifest_of(out)["labels"] for c in label["cells"]}
+        first = sum(levels[cell][0]["bytes"] for cell, level in pack["order"] if level == 1)
+        page = (out / "index.html").read_text()
+        assert page == f'<head><meta name="pack" content="{pack["uri"]} {first}" /></head>'
         assert has_viewer(out, viewer)
         write_documents(out, contents)  # names it anew
 
@@ -447,7 +449,6 @@ def test_levels_that_replace_are_in_the_manifest(tmp_path, contents, viewer) -> 
     assert {"refine"} & {key for level in others for key in level} == set()
     assert manifest["totals"]["count"] == 39 - 6  # of the full scene
     assert written.chunks == sum(chunk.nbytes for chunk in chunks) > manifest["totals"]["bytes"]
-    assert manifest["pack"]["bytes"] == written.chunks
     assert len(read_ply(tmp_path / "out" / cells[1]["levels"][2]["uri"])) == 6
 
 
@@ -462,7 +463,7 @@ def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewe
     assert [level["weight"] for level in listed] == [round(one.weight or 0, 6) for one in made.increments]
     assert {level["format"] for level in listed} == {"stream"}
     assert len(list((tmp_path / "out" / "chunks").iterdir())) == 3
-    assert len(packed_parts(tmp_path / "out")) == len(listed)
+    assert 4 <= len(packed_parts(tmp_path / "out")) <= len(listed)
     assert written.chunks == manifest["totals"]["bytes"]
 
 
@@ -501,12 +502,12 @@ def order_at_origin(*ladders: Ladder, behind: Sequence[int] = ()) -> list[tuple[
     return order_of(ladders, cells, {}, pinhole(), 0.95)
 
 
-def test_in_the_pack_what_the_first_view_skips_comes_last() -> None:
+def test_what_the_first_view_does_not_need_is_not_in_the_pack() -> None:
     one = Ladder([10, 20, 100, 50], 1.0, [3])  # unknown: wanted in full
-    assert order_at_origin(one) == [(0, 1), (0, 3), (0, 4), (0, 2)]
+    assert order_at_origin(one) == [(0, 1), (0, 3), (0, 4)]  # the third replaces the second
     order = order_at_origin(replace(one, replaces=()), replace(one, replaces=[2, 3]))
-    assert order[-1] == (1, 2)
-    assert sorted(order) == [(i, k) for i in (0, 1) for k in (1, 2, 3, 4)]
+    assert sorted(order) == [(i, k) for i in (0, 1) for k in (1, 2, 3, 4) if (i, k) != (1, 2)]
+    assert order_at_origin(one, one, behind=[0, 1]) == [(0, 1), (1, 1)]
     assert costs_of([one, Ladder([5])]).tolist() == [[10, 30, 100, 150], [5, 5, 5, 5]]
 
 
@@ -517,7 +518,7 @@ def test_what_gains_more_a_byte_comes_first_in_the_pack() -> None:
     assert order_at_origin(dear, one)[2:] == [(1, 2), (1, 3), (0, 2), (0, 3)]
     assert order_at_origin(one, one) == [(0, 1), (1, 1), (0, 2), (1, 2), (0, 3), (1, 3)]
     assert order_at_origin(replace(one, weight=0.0)) == [(0, 1), (0, 2), (0, 3)]
-    assert order_at_origin(one, one, behind=[0]) == [(1, 1), (0, 1), (1, 2), (1, 3), (0, 2), (0, 3)]
+    assert order_at_origin(one, one, behind=[0]) == [(1, 1), (0, 1), (1, 2), (1, 3)]
     assert order_at_origin() == []
 
 

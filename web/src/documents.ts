@@ -149,7 +149,7 @@ export interface Reference {
   bytes: number;
   sha256: Sha256;
 }
-/** All increments concatenated in one file: one stream is faster than many files. */
+/** Increments that the first view needs, concatenated in one file: the first levels of all cells, then those of larger gain. Few ranges of it are faster than many of other files. */
 export interface Pack {
   uri: Path;
   /** Sum over the increments in it. */

@@ -2,6 +2,7 @@ import { inAdvance } from "./core/advance";
 import type { Fetch } from "./core/download";
 import { bundleUrl, type Embed, linkTo, type Options, parseOptions } from "./embed";
 import { bytesFrom, type Source, sourceInside } from "./inside";
+import { formatName } from "./ui/format";
 import { fail, hideNotice, messageOf } from "./ui/notice";
 import { buildPage } from "./ui/page";
 import { colorsOf } from "./view/colors";
@@ -36,9 +37,9 @@ async function begin(): Promise<void> {
 async function showOnline(app: HTMLElement, options: Options): Promise<void> {
   const base = bundleUrl(options.bundle, location.href);
   const online: Fetch = (url, init) => fetch(url, init);
-  const name = options.bundle ? null : packNamed(document);
-  if (!name) return show(app, { base, fetch: online }, options);
-  const pack = inAdvance(online, new URL(name, base).href);
+  const named = options.bundle ? null : packNamed(document);
+  if (!named) return show(app, { base, fetch: online }, options);
+  const pack = inAdvance(online, new URL(named.uri, base).href, named.bytes);
   try {
     await show(app, { base, fetch: pack.fetch }, options);
   } finally {
@@ -51,7 +52,7 @@ async function show(app: HTMLElement, source: Source, options: Options): Promise
   const { canvas } = viewer.stage;
   canvas.id = "view";
   app.removeAttribute("hidden");
-  document.title = `${viewer.manifest.name} · sagesplat`;
+  document.title = `${formatName(viewer.manifest.name)} · sagesplat`;
   hideNotice();
   if (options.ui) buildPage(app, viewer);
   window.sagesplat = Object.assign(window.sagesplat, embed(viewer));
@@ -68,10 +69,11 @@ async function show(app: HTMLElement, source: Source, options: Options): Promise
   removePosterWhenDrawn(viewer, canvas);
 }
 
-/** The pack that the page of a bundle names, so that it is asked for together with the manifest. */
-function packNamed(page: ParentNode): string | null {
-  const name = page.querySelector<HTMLMetaElement>('meta[name="pack"]')?.content ?? "";
-  return /^\w[\w-]*\.pack$/.test(name) ? name : null;
+/** The pack that the page of a bundle names, and what every plan wants of it: asked for together with the manifest. */
+function packNamed(page: ParentNode): { uri: string; bytes: number } | null {
+  const content = page.querySelector<HTMLMetaElement>('meta[name="pack"]')?.content ?? "";
+  const [, uri, bytes] = /^(\w[\w-]*\.pack) ([1-9]\d*)$/.exec(content) ?? [];
+  return uri ? { uri, bytes: Number(bytes) } : null;
 }
 
 /** Removes the poster when the scene is drawn, or at the first input. */
@@ -79,6 +81,11 @@ function removePosterWhenDrawn(viewer: Viewer, canvas: HTMLCanvasElement): void 
   const poster = document.getElementById("poster");
   if (!poster) return;
   canvas.after(poster); // above the scene, below the panel
+  if (poster instanceof HTMLImageElement)
+    void meanOf(poster).then(
+      (mean) => viewer.setMean(mean),
+      () => {},
+    );
   const down = () => {
     stop();
     poster.remove();
@@ -90,6 +97,17 @@ function removePosterWhenDrawn(viewer: Viewer, canvas: HTMLCanvasElement): void 
     canvas.addEventListener(event, down, { once: true });
   }
   if (viewer.photo >= 0) down(); // the poster shows another view
+}
+
+/** The mean colour of a picture, 0 to 255. */
+async function meanOf(picture: HTMLImageElement): Promise<readonly number[]> {
+  await picture.decode();
+  const canvas = document.createElement("canvas");
+  const context = canvas.getContext("2d");
+  [canvas.width, canvas.height] = [16, 16];
+  context?.drawImage(picture, 0, 0, 16, 16);
+  const pixels = [...(context?.getImageData(0, 0, 16, 16).data ?? [])];
+  return [0, 1, 2].map((i) => pixels.reduce((sum, value, k) => sum + (k % 4 === i ? value / 256 : 0), 0));
 }
 
 /** Reloads a live bundle when training is finished: it then has levels. */

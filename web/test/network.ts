@@ -5,6 +5,7 @@ import { inAdvance } from "../src/core/advance";
 import { rotate } from "../src/core/distance";
 import type { Fetch } from "../src/core/download";
 import { loadManifest, parsePromises } from "../src/core/manifest";
+import { Pack } from "../src/core/pack";
 import { ladderOf } from "../src/core/planner";
 import { entriesOf } from "../src/core/residency";
 import { Streamer } from "../src/core/streamer";
@@ -62,7 +63,12 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
   const { fidelity } = manifest.promises;
   if (fidelity) put(fidelity.uri, documents.promises);
   putIncrements(network, manifest);
-  return { clock, network, renderer: new FakeRenderer(clock) };
+  const renderer = new FakeRenderer(clock);
+  const replacing = cellsOf(manifest).flatMap(({ levels }) =>
+    levels.flatMap((l, k) => (l.refine ? [k + 1] : [])),
+  );
+  renderer.begins = [...new Set([1, ...replacing])];
+  return { clock, network, renderer };
 }
 
 /** Says the expected SSIM of some levels of cells (0: nothing) at a viewpoint: 0 where nothing is drawn. */
@@ -105,8 +111,9 @@ function startView(manifest: Manifest): Viewpoint {
 
 /** The page names the pack, which is asked for together with the manifest. */
 function packInAdvance({ manifest }: Documents, { fetch }: Network): Fetch {
-  const { pack }: Manifest = JSON.parse(manifest);
-  return pack ? inAdvance(fetch, new URL(pack.uri, BASE).href).fetch : fetch;
+  const { beginning } = new Pack(JSON.parse(manifest));
+  const bytes = beginning.reduce((sum, file) => sum + file.bytes, 0);
+  return bytes ? inAdvance(fetch, new URL(beginning[0]?.uri ?? "", BASE).href, bytes).fetch : fetch;
 }
 
 /** SSIM over time of the streamer, which fetches everything in the end or what a target asks for. */

@@ -35,7 +35,7 @@ def with_poster(page: str) -> str:
     return page.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />')
 
 
-def with_pack(page: str, uri: str | None) -> str:
-    """The page with the name of the bundle's pack, which it then asks for together with the manifest."""
-    named = "<!-- pack -->" if uri is None else f'<meta name="pack" content="{uri}" />'
-    return _PACK.sub(lambda _: named, page, count=1)
+def with_pack(page: str, named: tuple[str, int] | None) -> str:
+    """The page with the name of the bundle's pack, and how many bytes of it to ask for with the manifest."""
+    tag = "<!-- pack -->" if named is None else f'<meta name="pack" content="{named[0]} {named[1]}" />'
+    return _PACK.sub(lambda _: tag, page, count=1)

@@ -1,6 +1,6 @@
 """Writes bundles: static folders with the increments of nested levels, their quality bounds, and the viewer.
 
-chunks/ holds the increments, scene-*.pack all of them again as one stream, manifest.json and promises-*.json
+chunks/ holds the increments, scene-*.pack again those of the first view, manifest.json and promises-*.json
 describe them (`viewer.manifest`). The same contents give the same bytes.
 """
 
@@ -19,7 +19,7 @@ from sagesplat.io.files import atomic_folder, unwritable, write_text
 from sagesplat.io.typed import known_json
 from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_pack, with_poster
 from sagesplat.viewer.manifest import FORMAT, THIRD_PARTY, Contents, documents, pack_order
-from sagesplat.viewer.pack import write_pack
+from sagesplat.viewer.pack import beginning_of, write_pack
 from sagesplat.viewer.quality import dumped
 
 _CURE = "delete that folder and run `sagesplat nest` again"
@@ -76,10 +76,10 @@ def _put_up(folder: Path, poster: bytes) -> None:
     write_text(page, with_poster(page.read_text(encoding="utf-8")))
 
 
-def _name_pack(page: Path, uri: str) -> None:
-    """Name the pack in the page, so that no round trip passes before it is asked for."""
+def _name_pack(page: Path, uri: str, beginning: int) -> None:
+    """Name the pack in the page, so that no round trip passes before these bytes of it are asked for."""
     if page.is_file():
-        write_text(page, with_pack(page.read_text(encoding="utf-8"), uri))
+        write_text(page, with_pack(page.read_text(encoding="utf-8"), (uri, beginning)))
 
 
 def write_documents(folder: Path, contents: Contents) -> BundleSizes:
@@ -87,7 +87,7 @@ def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     manifest, promises = documents(contents, (folder / THIRD_PARTY).exists())
     if contents.chunks and not contents.live:
         manifest["pack"] = write_pack(folder, manifest["labels"], pack_order(contents))
-        _name_pack(folder / PAGE, manifest["pack"]["uri"])
+        _name_pack(folder / PAGE, manifest["pack"]["uri"], beginning_of(manifest))
     for quality, content in promises.items():
         (folder / manifest["promises"][quality]["uri"]).write_bytes(content)
     write_text(folder / SCHEMA, files("sagesplat.viewer").joinpath(SCHEMA).read_text(encoding="utf-8"))

@@ -1,19 +1,21 @@
-"""The pack: all increments of a bundle in one file, for the first load without a round trip per increment.
+"""The pack: the increments that the first view needs in one file, for a first load in few requests.
 
-It is a concatenation of the increments, in the order of their benefit for the first view: level 1 of all
-cells, those in sight first; then the upgrades by which categories reach the target; then all others, by gain
-of expected quality x pixel share per byte, those out of sight last. Levels of a cell must come in order, so
-an increment counts with the slope of the concave hull of quality over bytes. The viewer orders by the same
-gains (web/src/core/order.ts).
+It is a concatenation of increments, in the order of their benefit for the first view: level 1 of all cells,
+those in sight first, which the page asks for together with the manifest; then the upgrades by which
+categories reach the target, by gain of expected quality x pixel share per byte. Levels of a cell must come
+in order, so an increment counts with the slope of the concave hull of quality over bytes. The viewer orders
+by the same gains (web/src/core/order.ts), and asks for ranges of the pack. A server without ranges sends
+all of it: so nothing is in it that the first view does not need.
 
-Where the first view needs a level that replaces those below, the ones between the first and that come last:
-nobody is to download what is thrown away at once.
+Where the first view needs a level that replaces those below, the ones between the first and that are left
+out: nobody is to download what is thrown away at once.
 """
 
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +59,7 @@ def order_of(
     camera: Camera,
     target: float,
 ) -> list[tuple[int, int]]:
-    """(cell id, level) of all files, ordered for the view of a camera.
+    """(cell id, level) of the files that the view of a camera needs, in their order.
 
     `ladders`: of the cells, in their order. `models`: of fidelity, with the files' levels. `target`: that a
     viewer begins with.
@@ -71,16 +73,18 @@ def order_of(
     ranked = []
     for row, (cell, ladder) in enumerate(zip(cells.ids.tolist(), ladders, strict=True)):
         visible, last = bool(share[row] > 0), len(ladder.sizes)
-        path, skipped = _path(ladder, min(int(wanted[row]), last))
+        path = _path(ladder, min(int(wanted[row]), last))
         total = np.cumsum(np.take(ladder.sizes, path - 1), dtype=np.float64)
         known = not np.isnan(mean[row]).any()
         quality = mean[row, path - 1] if known else np.sqrt(total / total[-1])
         weight = max(ladder.weight * max(float(share[row]), LEAST_SHARE), _LEAST**2)
         ranked.append((0 if visible else 1, -weight / total[0], cell, 1))
-        for k, gain in zip(path[1:].tolist(), gains_of(quality, total).tolist(), strict=True):
-            rank = 4 if not visible else 2 if k <= wanted[row] else 3
-            ranked.append((rank, -weight * gain, cell, k))
-        ranked += [(5, 0.0, cell, k) for k in skipped]
+        gains = gains_of(quality, total).tolist()
+        ranked += [
+            (2, -weight * gain, cell, level)
+            for level, gain in zip(path[1:].tolist(), gains, strict=True)
+            if visible and level <= wanted[row]
+        ]
     return [(cell, level) for *_, cell, level in sorted(ranked)]
 
 
@@ -104,7 +108,7 @@ def gains_of(ssim: Float[np.ndarray, " K"], total: Float[np.ndarray, " K"]) -> F
 def write_pack(
     folder: Path, labels: Sequence[dict[str, Any]], order: Sequence[tuple[int, int]]
 ) -> dict[str, Any]:
-    """Write the increments of a manifest's labels, which are in `folder`, as one pack; its manifest entry."""
+    """Write increments of a manifest's labels, which are in `folder`, as one pack; its manifest entry."""
     unnamed, digest, size = folder / "scene.pack", hashlib.sha256(), 0
     levels = {cell["id"]: cell["levels"] for label in labels for cell in label["cells"]}
     with unnamed.open("wb") as file:
@@ -120,8 +124,14 @@ def write_pack(
     return {"uri": uri, "bytes": size, "sha256": digest.hexdigest(), "order": [list(one) for one in order]}
 
 
-def _path(ladder: Ladder, wanted: int) -> tuple[np.ndarray, list[int]]:
-    """The levels whose files a viewer loads for a level, and beyond it; and those that it skips."""
-    every = range(1, 1 + len(ladder.sizes))
+def beginning_of(manifest: Mapping[str, Any]) -> int:
+    """Bytes of the first levels at the beginning of a manifest's pack, which every plan wants."""
+    levels = {cell["id"]: cell["levels"] for label in manifest["labels"] for cell in label["cells"]}
+    first = takewhile(lambda one: one[1] == 1, manifest["pack"]["order"])
+    return sum(levels[cell][0]["bytes"] for cell, _ in first)
+
+
+def _path(ladder: Ladder, wanted: int) -> np.ndarray:
+    """The levels whose files a viewer loads for a level, and beyond it."""
     start = max((level for level in ladder.replaces if level <= wanted), default=1)
-    return np.array([1, *range(max(start, 2), len(ladder.sizes) + 1)]), list(every[1 : start - 1])
+    return np.array([1, *range(max(start, 2), len(ladder.sizes) + 1)])

@@ -9,14 +9,20 @@ export interface Advance {
   cancel(): void;
 }
 
-/** Asks for a file at once; who asks for it first gets that answer. */
-export function inAdvance(fetch: Fetch, url: string): Advance {
+/**
+ * Asks for the beginning of a file at once; who asks for it first gets that answer.
+ *
+ * @param bytes - of it
+ */
+export function inAdvance(fetch: Fetch, url: string, bytes: number): Advance {
   const abort = new AbortController();
-  let early: ReturnType<Fetch> | null = fetch(url, { signal: abort.signal });
+  const headers = { Range: `bytes=0-${bytes - 1}` };
+  let early: ReturnType<Fetch> | null = fetch(url, { signal: abort.signal, headers });
   early.catch(() => {}); // who takes it asks again
   return {
     fetch: async (asked, init) => {
-      if (asked !== url || !early || init?.cache || init?.headers) return fetch(asked, init);
+      const isSame = asked === url && new Headers(init?.headers).get("Range") === headers.Range;
+      if (!isSame || !early || init?.cache) return fetch(asked, init);
       const answer = early;
       early = null;
       init?.signal?.addEventListener("abort", () => abort.abort(), { once: true });

@@ -93,7 +93,7 @@ export interface Range {
 export interface ReceiveOptions {
   readonly range?: Range; // all that is asked for
   readonly again?: boolean; // bypasses the browser's cache
-  readonly silence?: number; // ms without data after which the download counts as failed
+  readonly silence?: number | undefined; // ms without data after which the download counts as failed
   readonly check?: (reply: Reply) => void; // throws for an unusable response
 }
 

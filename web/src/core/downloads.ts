@@ -2,9 +2,9 @@
 
 import { Bandwidth } from "./bandwidth";
 import { LruCache } from "./cache";
-import { DamagedError, DownloadError, download, type File, intact, type Link } from "./download";
+import { DamagedError, DownloadError, download, type File, type Link } from "./download";
 import { type Load, Loads } from "./loads";
-import { lateIn, Pack } from "./pack";
+import type { Pack } from "./pack";
 import { consecutive, downloadRanges, rangesOf } from "./ranges";
 
 /** A failed download. */
@@ -23,10 +23,12 @@ const MAX_DOWNLOADS = 16; // concurrent downloads; browsers allow only 6 without
 const SECONDS_IN_FLIGHT = 0.25; // seconds of bandwidth to keep in flight: more than a round trip
 const BYTES_AT_UNKNOWN_RATE = 32_768; // bytes in flight while the bandwidth is unknown
 const REQUESTS_PER_TRIP = 3; // requests that a round trip's bytes are divided between: browsers allow 6
+const PACK_SILENCE = 3000; // ms without data after which what the pack brings is asked for otherwise
 const LEAST_REQUEST_BYTES = 8192; // bytes of ranges that one request brings at least, if they are wanted
 
 export interface DownloadsOptions extends Omit<Link, "received" | "answered"> {
   readonly keepBytes: number; // cache of downloaded files
+  readonly cache?: LruCache | undefined; // instead: of another's, who has the same bundle
   readonly changed: () => void; // called when a file arrived, failed or may be retried
   readonly maxDownloads?: number;
 }
@@ -36,23 +38,23 @@ export class Downloads {
   received = 0; // bytes in all
   /** Why the pack is unusable, if it does not match the manifest. */
   note: string | null = null;
-  private pack: Pack | null = null;
+  private pack: Pack | null = null; // null also once it turned out to be of no use
   private damaged = 0; // damaged files of the pack
   private roundTrip = Infinity; // ms
   private readonly unverified = new Set<string>(); // files of a pack whose hash could not be checked
   private readonly loads = new Loads();
   private ranges: ReadonlyMap<string, readonly File[]> = new Map(); // of files, by uri
-  private planned: ReadonlySet<string> = new Set(); // files of the plan, here or not
-  private sendsRanges: boolean | null = null; // whether the server does; null: it was not asked
+  /** Whether the server answers with ranges; null: it was not asked. */
+  sendsRanges: boolean | null = null;
   private readonly arrived = new Map<string, Uint8Array>(); // arrived files, until they are taken
   private readonly failures = new Map<string, Failure>();
-  private readonly cache: LruCache;
+  readonly cache: LruCache;
   private readonly link: Link;
   private closed = false;
 
   constructor(private readonly options: DownloadsOptions) {
     this.bandwidth = new Bandwidth(options.clock);
-    this.cache = new LruCache(options.keepBytes);
+    this.cache = options.cache ?? new LruCache(options.keepBytes);
     const received = (bytes: number) => {
       this.received += bytes;
       this.bandwidth.count(bytes);
@@ -64,7 +66,7 @@ export class Downloads {
   }
 
   get running(): number {
-    return this.loads.all.size + (this.pack ? 1 : 0);
+    return this.loads.all.size;
   }
 
   /** Names all ranges of files, in their order. */
@@ -72,16 +74,15 @@ export class Downloads {
     this.ranges = rangesOf(files);
   }
 
-  /** Whether a pack is loading. */
+  /** Whether anything of a pack is on its way. */
   get hasPack(): boolean {
-    return this.pack !== null;
+    return [...this.loads.all].some(({ isPack }) => isPack);
   }
 
-  /** Starts loading a pack; files that it brings in time are not downloaded separately. */
-  openPack(file: File, files: readonly File[]): void {
-    this.begin();
-    this.pack = new Pack(file, files);
-    void this.receive(this.pack);
+  /** Starts loading the beginning of a pack, and takes from it what one request brings. */
+  openPack(pack: Pack): void {
+    this.pack = pack;
+    if (pack.beginning.length) void this.run(pack.beginning);
   }
 
   isHere(file: File): boolean {
@@ -120,17 +121,12 @@ export class Downloads {
     this.failures.set(file.sha256, { message, lasting: true, tries: 1, until: Infinity });
   }
 
-  /**
-   * Starts the best of the wanted downloads, as many as the link can use; stops the pack when it is useless.
-   *
-   * @param undecided - more files may be wanted soon, and values are still estimates
-   */
-  fill(wanted: readonly File[], undecided = false): void {
-    const single = this.pack ? this.outsidePack(this.pack, wanted, undecided) : wanted;
-    for (const file of single) {
+  /** Starts the best of the wanted downloads, as many as the link can use. */
+  fill(wanted: readonly File[]): void {
+    for (const file of wanted) {
       if (!this.hasRoom()) return;
       if (this.loads.has(file) || this.isBackingOff(file) || this.mayComeWhole(file)) continue;
-      void this.run(this.requestFor(file, single));
+      void this.run(this.requestFor(file, wanted));
     }
   }
 
@@ -143,15 +139,24 @@ export class Downloads {
   /** What is asked for together with a file: of ranges those that touch, of a server without ranges all. */
   private requestFor(file: File, wanted: readonly File[]): readonly File[] {
     const all = this.ranges.get(file.uri);
-    if (!all || this.sendsRanges === false) return all ?? [file];
+    if (this.sendsRanges === false) return all ?? [file];
     const missing = wanted.filter((one) => !this.loads.has(one) && !this.isBackingOff(one));
-    return consecutive(
-      file,
-      all,
-      missing,
-      this.room,
-      Math.max(this.trip / REQUESTS_PER_TRIP, LEAST_REQUEST_BYTES) || LEAST_REQUEST_BYTES,
-    );
+    const own = all ? consecutive(file, all, missing, this.room, this.few) : [file];
+    const packed = this.fromPack(file, missing);
+    return packed.length > own.length ? packed : own;
+  }
+
+  private fromPack(file: File, missing: readonly File[]): readonly File[] {
+    if (!this.pack) return [];
+    const sound = missing.filter(({ sha256 }) => !this.failures.has(sha256)); // damaged there, perhaps
+    const keys = new Set(sound.map(({ sha256 }) => sha256));
+    if (!keys.has(file.sha256)) return [];
+    return this.pack.around(file, (sha256) => keys.has(sha256), Math.max(this.room, this.few));
+  }
+
+  /** Bytes of ranges that one request brings at least, if they are wanted. */
+  private get few(): number {
+    return Math.max(this.trip / REQUESTS_PER_TRIP, LEAST_REQUEST_BYTES) || LEAST_REQUEST_BYTES;
   }
 
   /** Bytes per round trip of the link; NaN: unknown. */
@@ -159,35 +164,8 @@ export class Downloads {
     return this.roundTrip < Infinity ? (this.roundTrip * this.bandwidth.rate) / 1000 : Number.NaN;
   }
 
-  /** The wanted files that the pack does not bring, or brings late. */
-  private outsidePack(pack: Pack, wanted: readonly File[], undecided: boolean): readonly File[] {
-    if (this.ranges.size && !pack.isHere) {
-      const isPlanned = ({ sha256 }: File) => this.planned.has(sha256);
-      const missing = new Set(wanted.filter((file) => !this.loads.has(file)));
-      const spare = pack.spare(isPlanned, (file) => missing.has(file));
-      if (spare > this.trip) {
-        pack.stop(); // ranges bring the rest without what lies between
-        return wanted;
-      }
-    }
-    const brought = wanted.filter((file) => !this.loads.has(file) && pack.until(file) >= 0);
-    const late = undecided ? new Set() : lateIn(pack, brought, this.trip);
-    let brings = false;
-    let before = 0; // bytes of larger value that the pack brings
-    const single = wanted.filter((file) => {
-      const mine = pack.until(file) >= 0 && !this.loads.has(file) && !late.has(file);
-      brings ||= mine;
-      if (mine) before += file.bytes;
-      // what is asked for now comes after a round trip; files that the pack does not hold wait for larger value
-      return !mine && (!brings || (pack.holds(file) && before < this.trip));
-    });
-    if (!brings && !undecided && !pack.isHere) pack.stop();
-    return single;
-  }
-
   /** Aborts downloads that are no longer wanted, unless they are nearly complete. */
   keepOnly(wanted: ReadonlySet<string>): void {
-    this.planned = wanted;
     this.loads.keepOnly(wanted);
     this.pauseBandwidth();
     for (const key of this.arrived.keys()) if (!wanted.has(key)) this.arrived.delete(key);
@@ -200,11 +178,10 @@ export class Downloads {
 
   close(): void {
     this.closed = true;
-    this.pack?.stop();
     for (const load of this.loads.all) this.loads.drop(load);
     this.pauseBandwidth();
     this.arrived.clear();
-    this.cache.clear();
+    if (!this.options.cache) this.cache.clear();
   }
 
   /** Number of concurrent downloads: many for small files, to fill the link; more would only weaken the order. */
@@ -233,34 +210,6 @@ export class Downloads {
     if (!this.running) this.bandwidth.running(false);
   }
 
-  private async receive(pack: Pack): Promise<void> {
-    try {
-      await pack.read(this.link, (file, content) => this.accept(file, content));
-    } catch (error) {
-      if (error instanceof DamagedError) this.note = `${error.message}; files are loaded one by one.`;
-    }
-    this.pack = null;
-    this.pauseBandwidth();
-    if (!this.closed) this.options.changed();
-  }
-
-  /** Verifies a file of the pack; a damaged one is downloaded again separately. */
-  private async accept(file: File, content: Uint8Array): Promise<void> {
-    if (this.closed || this.isHere(file)) return;
-    try {
-      await intact(this.link, file, content);
-      if (this.closed) return;
-      if (!this.link.digest) this.unverified.add(file.sha256);
-      this.loads.forget(file);
-      this.store(file, content);
-    } catch (error) {
-      this.damaged += 1;
-      if (this.damaged > 1) this.pack?.stop(); // the rest is likely damaged too
-      this.fail(file, error);
-    }
-    this.options.changed();
-  }
-
   private store(file: File, content: Uint8Array): void {
     this.failures.delete(file.sha256);
     this.arrived.set(file.sha256, content);
@@ -269,20 +218,28 @@ export class Downloads {
 
   private async run(files: readonly File[]): Promise<void> {
     this.begin();
-    const load = this.loads.begin(files);
-    const again = files.some(({ sha256 }) => this.failures.has(sha256));
     const [file] = files as readonly [File];
+    const isPack = file.uri === this.pack?.files[0]?.uri;
+    const load = this.loads.begin(files, isPack);
+    const again = files.some(({ sha256 }) => this.failures.has(sha256));
     try {
       if (file.offset === undefined) await this.runFile(load, file, again);
       else await this.runRanges(load, files, again);
     } catch (error) {
       const missing = load.files.find((one) => this.loads.brings(load, one));
-      if (missing) this.fail(missing, error);
+      if (isPack) this.leavePack(error);
+      else if (missing) this.fail(missing, error);
     }
     if (load.dropped) return;
     this.loads.end(load);
     this.pauseBandwidth();
     this.options.changed();
+  }
+
+  /** All that the pack has comes otherwise from now on. */
+  private leavePack(error: unknown): void {
+    this.pack = null;
+    if (error instanceof DamagedError) this.note = `${error.message}; files are loaded one by one.`;
   }
 
   private async runFile(load: Load, file: File, again: boolean): Promise<void> {
@@ -295,7 +252,8 @@ export class Downloads {
   }
 
   private async runRanges(load: Load, files: readonly File[], again: boolean): Promise<void> {
-    const all = this.ranges.get((files[0] as File).uri) ?? files;
+    const { isPack } = load;
+    const all = (isPack ? this.pack?.files : this.ranges.get((files[0] as File).uri)) ?? files;
     const came = (file: File, then: () => void) => {
       if (load.dropped || (!this.loads.came(load, file) && this.isHere(file))) return;
       then();
@@ -304,6 +262,7 @@ export class Downloads {
     await downloadRanges(this.link, files, all, {
       abort: load.abort,
       again,
+      silence: isPack ? PACK_SILENCE : undefined,
       answered: (ranges) => {
         this.sendsRanges = ranges;
         if (ranges) return;
@@ -313,11 +272,17 @@ export class Downloads {
       },
       take: (file, content) => {
         came(file, () => {
-          this.unverified.delete(file.sha256);
+          if (isPack && !this.link.digest) this.unverified.add(file.sha256);
+          else this.unverified.delete(file.sha256);
           this.store(file, content);
         });
       },
-      corrupt: (file, error) => came(file, () => this.fail(file, error)),
+      corrupt: (file, error) =>
+        came(file, () => {
+          this.fail(file, error);
+          this.damaged += Number(isPack);
+          if (this.damaged > 1) this.pack = null; // what follows is likely damaged too
+        }),
       progress: (got) => {
         load.got = got;
       },

@@ -8,6 +8,7 @@ export interface Load {
   readonly abort: AbortController;
   got: number; // bytes received
   dropped: boolean;
+  readonly isPack: boolean; // of ranges that come otherwise if it fails
   isWhole: boolean; // all ranges of a file come, from its beginning
 }
 
@@ -34,8 +35,15 @@ export class Loads {
     return this.byKey.has(sha256);
   }
 
-  begin(files: readonly File[]): Load {
-    const load: Load = { files, abort: new AbortController(), got: 0, dropped: false, isWhole: false };
+  begin(files: readonly File[], isPack = false): Load {
+    const load: Load = {
+      files,
+      abort: new AbortController(),
+      got: 0,
+      dropped: false,
+      isPack,
+      isWhole: false,
+    };
     this.claim(load, files);
     return load;
   }

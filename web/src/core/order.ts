@@ -72,13 +72,16 @@ interface Wanted {
 
 /**
  * The missing files of the plan, in order: first levels in sight and of cells nearby, the viewpoint models,
- * then increments by gain per byte. The viewpoint models come last if the plan does not depend on them.
+ * then increments by gain per byte.
+ *
+ * @param models - the viewpoint models come last if the plan does not depend on them; nothing comes after them
+ *   while it does: what is fetched for a plan that they change would be fetched in vain
  */
 export function inOrder(
   entries: readonly Entry[],
   downloads: Downloads,
   promises: readonly File[],
-  last = false,
+  models: "first" | "last" | "awaited" = "first",
 ): File[] {
   const base: Wanted[] = [];
   const behind: Wanted[] = []; // out of sight
@@ -117,10 +120,11 @@ export function inOrder(
         base.push({ file: one.file, value: weight / one.file.bytes, missing: true });
     }
   }
-  const models = promises.filter((file) => !downloads.isBackingOff(file));
+  const missing = promises.filter((file) => !downloads.isBackingOff(file));
   const [nearby, far] = divided(behind);
   const [smallest, more] = [[...best(base), ...best(nearby)], best([...rest, ...far])];
-  return last ? [...smallest, ...more, ...models] : [...smallest, ...models, ...more];
+  if (models === "awaited") return [...smallest, ...missing];
+  return models === "last" ? [...smallest, ...more, ...missing] : [...smallest, ...missing, ...more];
 }
 
 const best = (list: readonly Wanted[]): File[] =>

@@ -58,7 +58,7 @@ export async function downloadRanges(
   link: Link,
   wanted: readonly File[],
   all: readonly File[],
-  { abort, again, answered, take, corrupt, progress }: Ranges,
+  { abort, again, silence, answered, take, corrupt, progress }: Ranges,
 ): Promise<void> {
   const [first, last] = [wanted[0] as File, wanted.at(-1) as File];
   const start = first.offset ?? 0;
@@ -75,15 +75,15 @@ export async function downloadRanges(
     name = first.uri;
     cutter = new Cutter(all, cut);
   };
-  await receive(link, first, abort, { again, check, range }, (part) => {
+  await receive(link, first, abort, { again, check, range, silence }, (part) => {
     cutter.add(part);
     progress(cutter.taken);
     return cutter.taken <= cutter.size;
   });
   await Promise.all(checks);
   if (cutter.taken !== cutter.size) {
-    const is = cutter.taken < cutter.size ? `only ${cutter.taken}` : "more than";
-    throw new DamagedError(`${name}: damaged, ${is} of ${cutter.size} bytes came`, false);
+    const is = cutter.taken < cutter.size ? `only ${cutter.taken} of` : "more than";
+    throw new DamagedError(`${name}: damaged, ${is} ${cutter.size} bytes came`, false);
   }
 }
 
@@ -91,6 +91,7 @@ export async function downloadRanges(
 export interface Ranges {
   readonly abort: AbortController;
   readonly again: boolean; // bypasses the browser's cache
+  readonly silence: number | undefined; // ms without data after which it counts as failed
   readonly answered: (ranges: boolean) => void; // whether only what was asked for comes
   /** Called for every range that is intact, in their order. */
   readonly take: (file: File, content: Uint8Array) => void;

@@ -4,6 +4,7 @@ import type {
   Handle,
   Level,
   Manifest,
+  Promises,
   Quality,
   Renderer,
   Screens,
@@ -19,7 +20,7 @@ import { normalised, same } from "./inputs";
 import { poll } from "./live";
 import { parsePromises } from "./manifest";
 import { inOrder } from "./order";
-import { filesOf } from "./pack";
+import { Pack } from "./pack";
 import { makePlan, type Plan } from "./planner";
 import { screenOf } from "./quality";
 import { type Drawn, type Entry, entriesOf, exchange, gpuBytesOf, Hidden, settle } from "./residency";
@@ -35,6 +36,7 @@ export interface StreamerOptions {
   readonly now?: () => number; // ms, instead of the clock's
   readonly digest?: Digest;
   readonly keepBytes?: number; // cache of downloaded files
+  readonly beside?: Streamer; // one of the same bundle: what it has fetched is not fetched again
   readonly downloads?: number; // concurrent downloads, at most
 }
 
@@ -100,6 +102,7 @@ export class Streamer {
       clock: this.clock,
       digest: this.digest,
       keepBytes: options.keepBytes ?? FILE_CACHE_BYTES,
+      cache: options.beside?.downloads.cache,
       changed: () => this.arrived(),
       ...(options.downloads && { maxDownloads: options.downloads }),
     });
@@ -119,12 +122,16 @@ export class Streamer {
     return this.known;
   }
 
+  /** The viewpoint models that are planned with, once they are there. */
+  get promisesHere(): Promises | null {
+    return this.models.promises;
+  }
+
   /** Starts loading, for the bundle's start view until `update` is called. */
   start(): void {
     if (this.phase !== "new") return;
     this.phase = "running";
-    const { pack } = this.content;
-    if (pack) this.downloads.openPack(pack, filesOf(this.content));
+    if (this.content.pack && !this.options.beside) this.downloads.openPack(new Pack(this.content));
     this.plan();
     if (this.content.live) this.follow();
   }
@@ -213,9 +220,14 @@ export class Streamer {
     this.work();
   }
 
-  /** Sets the levels to go for: cells out of sight are raised once everything in sight is drawn as planned. */
+  /**
+   * Sets the levels to go for: cells out of sight are raised once everything in sight is drawn as planned, unless
+   * the server would send all of their levels.
+   */
   private aim(): void {
-    const isDrawn = this.entries.every(({ sight, shown, planned }) => !sight.visible || shown >= planned);
+    const canRaise = this.downloads.sendsRanges !== false;
+    const isDrawn =
+      canRaise && this.entries.every(({ sight, shown, planned }) => !sight.visible || shown >= planned);
     for (const e of this.entries) {
       const most = isDrawn ? e.around : Math.min(e.shown, e.around);
       e.wanted = e.sight.visible ? e.planned : Math.max(e.planned, most);
@@ -251,13 +263,12 @@ export class Streamer {
     this.hidden.shrink(this.settings.cacheBytes);
     this.decodeMore();
     const promises = this.missingPromises();
-    const planned = inOrder(this.entries, this.downloads, promises, this.promisesCanWait());
-    const queue = [...this.missingPalettes(), ...planned];
+    const models = this.isUndecided(promises) ? "awaited" : this.promisesCanWait() ? "last" : "first";
+    const planned = inOrder(this.entries, this.downloads, promises, models);
+    const queue = models === "awaited" ? planned : [...this.missingPalettes(), ...planned];
     this.pending = queue.length;
     this.downloads.keepOnly(this.wantedKeys);
-    const undecided =
-      this.settings.mode !== "base" && promises.some((file) => !this.downloads.isBackingOff(file));
-    this.downloads.fill(queue, undecided);
+    this.downloads.fill(queue);
     const took = this.clock.now() - begun;
     if (took > QUICK_MS) this.nextWork = begun + (1 + PAUSE) * took;
     this.changed();
@@ -272,13 +283,21 @@ export class Streamer {
     }
   }
 
+  /** Whether missing viewpoint models will change the plan. */
+  private isUndecided(promises: readonly File[]): boolean {
+    return this.dependsOnModels && promises.some((file) => !this.downloads.isBackingOff(file));
+  }
+
+  private get dependsOnModels(): boolean {
+    const { mode } = this.settings;
+    return this.planned !== "ok" || (mode !== "full" && mode !== "base");
+  }
+
   /** Whether viewpoint models can wait: the plan does not depend on them, and they would delay a small pack. */
   private promisesCanWait(): boolean {
-    const { mode } = this.settings;
     const { promises, content } = this;
     const { pack } = content;
-    if (!this.downloads.hasPack || this.planned !== "ok" || (mode !== "full" && mode !== "base"))
-      return false;
+    if (!this.downloads.hasPack || this.dependsOnModels) return false;
     return (promises?.bytes ?? 0) > DELAYING_SHARE * (pack?.bytes ?? 0);
   }
 

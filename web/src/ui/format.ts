@@ -32,11 +32,12 @@ export const nameOf = (quality: Quality): string => (quality === "fidelity" ? "f
  * The screens that promises are for. A larger one is promised what its picture has, averaged down to the largest.
  *
  * @param height - of what is drawn, pixels
+ * @param photos - what they are called
  */
-export function formatScreens({ least, most, here }: Screens, height: number): string {
+export function formatScreens({ least, most, here }: Screens, height: number, photos = "photos"): string {
   const from = least < most ? `${Number(least.toPrecision(2))} to ` : "";
-  const times = `of ${from}${Number(most.toPrecision(2))} times the photos' sharpness`;
-  const known = `Promises are for screens ${least === 1 && most === 1 ? "as sharp as the photos" : times}`;
+  const times = `of ${from}${Number(most.toPrecision(2))} times the ${photos}' sharpness`;
+  const known = `Promises are for screens ${least === 1 && most === 1 ? `as sharp as the ${photos}` : times}`;
   const averaged = `; compared as averaged down to ${Math.round((height * most) / here)} px`;
   return here > most ? known + averaged : known;
 }
@@ -50,4 +51,28 @@ export function formatShare(share: number): string {
 
 export function formatSsim(ssim: number): string {
   return Number.isFinite(ssim) ? ssim.toFixed(2) : "–";
+}
+
+const ENDINGS = /\.(compressed|cleaned|ply|splat|ksplat|spz|sog|gltf|glb)$/i;
+
+/** What a scene is called in a title: its name, which may be that of a file. */
+export function formatName(name: string): string {
+  let title = name;
+  while (ENDINGS.test(title)) title = title.replace(ENDINGS, "");
+  title = title.replace(/_+/g, " ").trim();
+  return title ? title.charAt(0).toUpperCase() + title.slice(1) : name;
+}
+
+/** What a fidelity looks like beside the full scene, in a few words; of SSIM against photos nothing is said. */
+export function formatLook(quality: Quality, target: number): string {
+  if (quality !== "fidelity") return "";
+  const looks: readonly (readonly [number, string])[] = [
+    [0.975, "hardly to be told from the full scene"],
+    [0.93, "differences show only side by side"],
+    [0.85, "the finest texture is a little softer"],
+    [0.75, "leaves and stone are softer, shapes stay"],
+    [0.6, "texture is smoothed away, edges are soft"],
+    [0, "shapes and colours only"],
+  ];
+  return looks.find(([from]) => target >= from)?.[1] ?? "";
 }

@@ -2,7 +2,7 @@ import { h, isTouch, textButton } from "./dom";
 
 const TOUCH: readonly (readonly [string, string])[] = [
   ["Drag", "orbit the scene, or look around in walk mode"],
-  ["Two fingers", "move sideways"],
+  ["Two fingers", "walk: drag them down to go ahead, aside to go aside"],
   ["Pinch", "move closer or farther"],
 ];
 const HELP: readonly (readonly [string, string])[] = [
@@ -12,7 +12,7 @@ const HELP: readonly (readonly [string, string])[] = [
   ["W A S D", "move; Q and E down and up, Shift faster"],
   ["Arrow keys", "turn"],
   ["O", "orbit or walk"],
-  ["[ and ]", "previous photo, next photo"],
+  ["[ and ]", "previous PHOTO, next PHOTO"],
   ["C", "compare with the full scene"],
   ["T", "colour by category, then by cell: the parts that have levels of their own"],
   ["L", "edit labels: click, or aim with the cross and press Enter; again for more or less of it"],
@@ -22,9 +22,16 @@ const HELP: readonly (readonly [string, string])[] = [
   ["Headset", "left stick moves, right stick turns"],
 ];
 
-/** The help dialog; Escape closes it. */
-export function helpDialog(): HTMLDialogElement {
-  const rows = (isTouch() ? TOUCH : HELP).flatMap(([key, text]) => [h("dt", {}, key), h("dd", {}, text)]);
+/**
+ * The help dialog; Escape closes it.
+ *
+ * @param photo - what one of the cameras is called
+ */
+export function helpDialog(photo: string): HTMLDialogElement {
+  const rows = (isTouch() ? TOUCH : HELP).flatMap(([key, text]) => [
+    h("dt", {}, key),
+    h("dd", {}, text.replaceAll("PHOTO", photo)),
+  ]);
   const close = textButton("Close", "primary", () => dialog.close());
   const note = h(
     "p",

@@ -2,11 +2,11 @@ import type { LabelState, Settings, State } from "../types";
 import type { Viewer } from "../view/viewer";
 import { h, setText } from "./dom";
 import { EditorCard } from "./editor";
-import { nameOf } from "./format";
+import { formatName, nameOf } from "./format";
 import { helpDialog } from "./help";
 import { Panel } from "./panel";
 import { splitSlider } from "./split";
-import { toolbar } from "./toolbar";
+import { photosOf, toolbar } from "./toolbar";
 import "./theme";
 import { welcome } from "./welcome";
 
@@ -17,10 +17,15 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
   const { manifest } = viewer;
   const panel = new Panel(viewer);
   const split = splitSlider(viewer);
-  const help = helpDialog();
+  const help = helpDialog(photosOf(manifest));
   const bar = h("div", { class: "progress", role: "progressbar", "aria-label": "Loading" }, h("i"));
   const status = h("span", { class: "status", role: "status" });
-  const title = h("header", { class: "title card" }, h("h1", {}, manifest.name), status);
+  const title = h(
+    "header",
+    { class: "title card" },
+    h("h1", { title: manifest.name }, formatName(manifest.name)),
+    status,
+  );
   const greeting = welcome(viewer.stage.canvas);
   if (greeting) title.append(greeting);
   const editor = new EditorCard(viewer.editor, viewer.token, () => update());
@@ -29,7 +34,7 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
   viewer.stage.canvas.setAttribute("role", "application");
   viewer.stage.canvas.setAttribute(
     "aria-label",
-    `${manifest.name}, a 3D scene. W A S D move, arrow keys turn, question mark for help.`,
+    `${formatName(manifest.name)}, a 3D scene. W A S D move, arrow keys turn, question mark for help.`,
   );
 
   let said: string | null = null;

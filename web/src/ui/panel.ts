@@ -5,8 +5,9 @@ import type { Quality, Settings } from "../types";
 import { isTyping } from "../view/controls";
 import { DEFAULT_TARGETS, type Viewer } from "../view/viewer";
 import { h, iconButton, setText, textButton } from "./dom";
-import { formatBytes, formatCount, formatScreens, formatSsim, nameOf } from "./format";
+import { formatBytes, formatCount, formatLook, formatScreens, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
+import { photosOf } from "./toolbar";
 
 const MODES: readonly (readonly [Settings["mode"], string])[] = [
   ["target", "Quality"],
@@ -84,10 +85,13 @@ export class Panel {
     const drawn = state.labels.filter(({ visible, label }) => visible && !this.viewer.isHidden(label.id));
     const least = leastPromise(drawn);
     const quality = nameOf(settings.quality);
-    setText(this.#summary, Number.isFinite(least) ? `${bytes} · ${quality} ≥ ${formatSsim(least)}` : bytes);
-    this.#summary.title = `Size of what is shown, and the least ${quality} promised of what is in sight; 1 is no difference`;
+    const fetched = `${bytes} shown, ${formatBytes(state.bytesLoaded)} fetched`;
+    const promise = `${quality} ≥ ${formatSsim(least)}`;
+    setText(this.#summary, Number.isFinite(least) ? `${fetched} · ${promise}` : fetched);
+    this.#summary.title = `Size of what is shown, of all that came for it, with what promises are made from, and the least ${quality} promised of what is in sight; 1 is no difference`;
     const { height } = this.viewer.stage.canvas;
-    setText(this.#screens, state.screens ? formatScreens(state.screens, height) : "");
+    const photos = `${photosOf(this.viewer.manifest)}s`;
+    setText(this.#screens, state.screens ? formatScreens(state.screens, height, photos) : "");
     this.#meter.style.setProperty("--value", String(state.bytesShown / Math.max(totals.bytes, 1)));
     for (const button of this.#modes) {
       const chosen = button.dataset.mode === settings.mode;
@@ -167,7 +171,19 @@ function sharing(viewer: Viewer): HTMLElement {
     else void document.documentElement.requestFullscreen();
   });
   const can = document.fullscreenEnabled ? [whole] : [];
-  return h("div", { class: "sharing" }, link, picture, ...can);
+  const free = textButton(
+    "Move freely",
+    "text",
+    () => {
+      viewer.bounds.isOn = !viewer.bounds.isOn;
+      free.setAttribute("aria-pressed", String(!viewer.bounds.isOn));
+    },
+    {
+      "aria-pressed": "false",
+      title: "Go anywhere, also where nothing was photographed and through surfaces",
+    },
+  );
+  return h("div", { class: "sharing" }, link, picture, ...can, free);
 }
 
 const rate = (bytes: number) => (Number.isFinite(bytes) ? ` · ${formatBytes(bytes)}/s` : "");
@@ -205,7 +221,8 @@ function slider(
 }
 
 function targetSlider(viewer: Viewer): Control {
-  return slider(
+  const look = h("small", { class: "look" });
+  const control = slider(
     "Keep quality at",
     ["target"],
     { min: 0.3, max: 0.99, step: 0.01 },
@@ -213,6 +230,14 @@ function targetSlider(viewer: Viewer): Control {
     (target) => viewer.set({ target }),
     ({ target, quality }) => `${nameOf(quality)} ${formatSsim(target)}`,
   );
+  control.element.append(look);
+  return {
+    element: control.element,
+    update: (settings) => {
+      control.update(settings);
+      setText(look, formatLook(settings.quality, settings.target));
+    },
+  };
 }
 
 const COMPARED: Readonly<Record<Quality, string>> = { fidelity: "the full scene", ssim: "the photos" };

@@ -1,4 +1,5 @@
 import { qualitiesOf } from "../core/manifest";
+import type { Manifest } from "../types";
 import { isTyping } from "../view/controls";
 import type { Viewer } from "../view/viewer";
 import { offered, type XrMode } from "../view/xr";
@@ -28,7 +29,7 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
     parts.say(
       viewer.controls.mode === "orbit"
         ? "Drag to orbit the scene"
-        : `Drag to look around, ${isTouch() ? "pinch" : "W A S D"} to walk`,
+        : `Drag to look around, ${isTouch() ? "two fingers" : "W A S D"} to walk`,
     );
   });
   const compare = iconButton("compare", "Compare with the full scene (C)", () => parts.split.toggle());
@@ -69,8 +70,13 @@ export function toolbar(viewer: Viewer, parts: Parts): { element: HTMLElement; u
   };
 }
 
+/** What the manifest's cameras are called: an adopted scene has viewpoints, and no photos. */
+export const photosOf = (manifest: Manifest): "photo" | "viewpoint" =>
+  qualitiesOf(manifest).includes("ssim") ? "photo" : "viewpoint";
+
 function photoPicker(viewer: Viewer): { elements: HTMLElement[]; step(by: number): void; update(): void } {
   const { cameras } = viewer.manifest;
+  const kind = photosOf(viewer.manifest);
   const go = (index: number) => {
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     viewer.goTo((index + cameras.length) % cameras.length, !still);
@@ -79,8 +85,11 @@ function photoPicker(viewer: Viewer): { elements: HTMLElement[]; step(by: number
   const options = cameras.map(({ name }, i) => h("option", { value: i }, name));
   const select = h(
     "select",
-    { "aria-label": "Photo position", change: () => select.value !== "-1" && go(Number(select.value)) },
-    h("option", { value: -1 }, qualitiesOf(viewer.manifest).includes("ssim") ? "Photos" : "Viewpoints"),
+    {
+      "aria-label": `Position of a ${kind}`,
+      change: () => select.value !== "-1" && go(Number(select.value)),
+    },
+    h("option", { value: -1 }, kind === "photo" ? "Photos" : "Viewpoints"),
     ...options,
   );
   return {
@@ -89,9 +98,9 @@ function photoPicker(viewer: Viewer): { elements: HTMLElement[]; step(by: number
           h(
             "span",
             { class: "photos" },
-            iconButton("previous", "Previous photo ([)", () => step(-1)),
+            iconButton("previous", `Previous ${kind} ([)`, () => step(-1)),
             select,
-            iconButton("next", "Next photo (])", () => step(1)),
+            iconButton("next", `Next ${kind} (])`, () => step(1)),
           ),
         ]
       : [],

@@ -3,7 +3,7 @@ import { remember, remembered } from "./storage";
 
 const KEY = "sagesplat-welcome";
 const MOUSE = "Drag to turn, scroll to come closer, W A S D to walk.";
-const TOUCH = "Drag to turn, pinch to come closer.";
+const TOUCH = "Drag to turn, pinch to come closer, two fingers walk.";
 const WHAT = "Each part of the scene loads only as finely as it needs to; the slider sets how finely.";
 
 /** Two lines for newcomers; gone at the first touch of the scene, and not shown again. */

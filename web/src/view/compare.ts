@@ -13,6 +13,7 @@ export class Compare {
     readonly stage: Stage,
     readonly manifest: Manifest,
     readonly source: Source,
+    readonly beside: Streamer,
     readonly settings: () => Settings,
   ) {}
 
@@ -32,8 +33,8 @@ export class Compare {
     this.#layer = layer;
     const budget = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
     const settings: Settings = { ...this.settings(), mode: "full", budget, cacheBytes: 0, aroundBytes: 0 };
-    const { manifest, source } = this;
-    this.#streamer = new Streamer({ manifest, ...source, renderer: layer, settings });
+    const { manifest, source, beside } = this;
+    this.#streamer = new Streamer({ manifest, ...source, renderer: layer, settings, beside });
     this.#streamer.onChange(onChange);
     this.#streamer.start();
     this.stage.full = layer;

@@ -1,3 +1,4 @@
+import type { Bounds } from "./bounds";
 import { between, dolly, look, orbit, pan, type Rig, walk } from "./motion";
 
 export type Mode = "orbit" | "walk";
@@ -6,6 +7,7 @@ const SPEED = 1.4; // metres per second: walking speed
 const FAST = 3.5; // factor with Shift
 const TURN = 1.6; // radians per second, by keyboard and gamepad
 const DRAG = 0.005; // radians per pixel
+const STRIDE = 0.005; // metres per pixel that one of two fingers moves
 const TRAVEL = 700; // ms from one photo to the next
 const DEAD = 0.15; // dead zone of a gamepad's stick
 
@@ -38,6 +40,7 @@ export class Controls {
 
   /**
    * @param onMove - called when the user or an animation moved the camera
+   * @param bounds - where the user may go
    * @param keys - what hears the keys
    * @param signal - ends all of it
    */
@@ -45,6 +48,7 @@ export class Controls {
     readonly canvas: HTMLElement,
     public rig: Rig,
     readonly onMove: (rig: Rig, byUser: boolean) => void,
+    readonly bounds: Bounds,
     { keys, signal }: { readonly keys: EventTarget; readonly signal: AbortSignal },
   ) {
     canvas.addEventListener("pointerdown", (event) => this.#down(event), { signal });
@@ -96,7 +100,7 @@ export class Controls {
 
   #user(rig: Rig): void {
     this.#travel = null;
-    this.#set(rig, true);
+    this.#set(this.bounds.confine(this.rig, rig), true);
   }
 
   #set(rig: Rig, byUser: boolean): void {
@@ -120,7 +124,8 @@ export class Controls {
     this.#pointers.set(event.pointerId, { ...last, x: event.clientX, y: event.clientY });
     if (other && before) {
       const after = Math.hypot(event.clientX - other.x, event.clientY - other.y);
-      this.#pan(dx / 2, dy / 2);
+      if (event.pointerType === "touch") this.#user(walk(this.rig, -dx * STRIDE, 0, dy * STRIDE));
+      else this.#pan(dx / 2, dy / 2);
       this.#closer(before / Math.max(after, 1));
     } else if (last.button === 2 || last.button === 1 || event.shiftKey) this.#pan(dx, dy);
     else if (this.mode === "orbit") this.#turn(-dx * DRAG, -dy * DRAG);
@@ -133,8 +138,10 @@ export class Controls {
   }
 
   #closer(factor: number): void {
-    if (this.mode === "orbit") this.#user(dolly(this.rig, factor));
-    else this.#user(walk(this.rig, 0, 0, -Math.log(factor) * 3));
+    const { rig } = this;
+    const most = this.bounds.step(rig);
+    if (this.mode === "orbit") this.#user(dolly(rig, Math.max(factor, 1 - most / rig.reach)));
+    else this.#user(walk(rig, 0, 0, Math.min(-Math.log(factor) * 3, most)));
   }
 
   #wheel(event: WheelEvent): void {

@@ -70,7 +70,8 @@ export function between(from: Rig, to: Rig, t: number): Rig {
   return rigAt(vec3(position), quat(q), mix(from.reach, to.reach));
 }
 
-function forward(rig: Rig): Vector3 {
+/** The direction of view. */
+export function forward(rig: Rig): Vector3 {
   return new Vector3(0, 0, -1).applyQuaternion(new Quaternion(...orientation(rig)));
 }
 

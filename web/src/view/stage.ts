@@ -14,6 +14,7 @@ import { orientation, type Rig } from "./motion";
 import { SparkLayer } from "./spark";
 
 const FOV = 60; // degrees, of the window's shorter side, unless a photo's lens is set
+const HIGHEST = 1.2; // tangent of half of a vertical field of view
 const NEAR = 0.03; // metres
 const LONGEST_HOLD = 600; // ms that a picture stays for want of the next one
 const FAR = 1e5; // beyond the sky of a large scene: up to 100 scene extents away
@@ -27,8 +28,12 @@ export class Stage {
   full: SparkLayer | null = null;
   split = 0.5; // share of the width that shows the full scene
   needsFrame = true;
+  /** What is behind all that is drawn while something in sight is missing: the scene's mean colour. */
+  mean: Color | null = null;
+  isIncomplete = false;
   #photo: Camera | null = null;
   #fovY: number | null = null;
+  readonly #background: Color; // that the scene was trained with
   #heldSince = Number.NaN; // ms
 
   /** Throws without WebGL 2. */
@@ -37,7 +42,7 @@ export class Stage {
     readonly manifest: Manifest,
   ) {
     this.renderer = new WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
-    this.renderer.setClearColor(background(manifest), 1);
+    this.#background = background(manifest);
     this.root = rootMatrix(manifest.frame);
     this.layer = this.newLayer();
   }
@@ -132,6 +137,7 @@ export class Stage {
   draw(mayHold = false): boolean {
     this.needsFrame = false;
     const { renderer, camera } = this;
+    renderer.setClearColor((this.isIncomplete && this.mean) || this.#background, 1);
     const view = this.viewpoint();
     for (const layer of [this.layer, this.full]) layer?.cull(view);
     if (this.#holds(view, mayHold && !renderer.xr.isPresenting)) return false;
@@ -185,9 +191,12 @@ export class Stage {
     this.invalidate();
   }
 
+  /** In a tall window no more is seen above and below than the photos saw: there is nothing beyond. */
   #usual(aspect: number): number {
     const half = Math.tan((FOV * Math.PI) / 360);
-    return 2 * Math.atan(aspect < 1 ? Math.min(half / aspect, 1.2) : half);
+    const photos = this.manifest.cameras.map(({ fovY }) => Math.tan(fovY / 2));
+    const most = photos.length ? Math.max(half, ...photos) : HIGHEST;
+    return 2 * Math.atan(aspect < 1 ? Math.min(half / aspect, most, HIGHEST) : half);
   }
 }
 

@@ -1,9 +1,10 @@
-import { Vector3 } from "three";
+import { Color, SRGBColorSpace, Vector3 } from "three";
 import { qualitiesOf } from "../core/manifest";
 import { Streamer } from "../core/streamer";
 import type { Embed, Options, Sample } from "../embed";
 import type { Source } from "../inside";
 import type { Budget, Manifest, Pose, Quality, Settings, State } from "../types";
+import { Bounds } from "./bounds";
 import { colorsOf } from "./colors";
 import { Compare } from "./compare";
 import { Controls } from "./controls";
@@ -21,6 +22,7 @@ const MAX_PIXEL_RATIO = 2; // device pixels per CSS pixel: more costs fill rate 
 /** The viewer without its UI: a bundle, a camera, and settings. */
 export class Viewer {
   readonly stage: Stage;
+  readonly bounds: Bounds;
   readonly controls: Controls;
   readonly streamer: Streamer;
   readonly headset: Headset;
@@ -53,14 +55,22 @@ export class Viewer {
     this.stage = new Stage(canvas, manifest);
     this.settings = startSettings(manifest, options);
     const moved = (rig: Rig, byUser: boolean) => this.#moved(rig, byUser);
-    this.controls = new Controls(canvas, this.#start(), moved, { keys, signal: this.#life.signal });
+    this.bounds = new Bounds(manifest, this.stage.root.clone());
+    const { signal } = this.#life;
+    this.controls = new Controls(canvas, this.#start(), moved, this.bounds, { keys, signal });
     this.streamer = new Streamer({
       manifest,
       ...source,
       renderer: this.stage.layer,
       settings: this.settings,
     });
-    this.compare = new Compare(this.stage, manifest, source, () => this.settings);
+    const stop = this.streamer.onChange(() => {
+      const { promisesHere } = this.streamer;
+      if (!promisesHere) return;
+      stop();
+      this.bounds.know(promisesHere, manifest.frame);
+    });
+    this.compare = new Compare(this.stage, manifest, source, this.streamer, () => this.settings);
     this.headset = new Headset(
       this.stage,
       () => this.settings.budget.count,
@@ -150,6 +160,12 @@ export class Viewer {
     }
   }
 
+  /** The scene's mean colour, 0 to 255: what is behind the picture while something in sight is missing. */
+  setMean([red = 0, green = 0, blue = 0]: readonly number[]): void {
+    this.stage.mean = new Color().setRGB(red / 255, green / 255, blue / 255, SRGBColorSpace);
+    this.stage.invalidate();
+  }
+
   pose(): Pose {
     return this.stage.pose();
   }
@@ -226,6 +242,9 @@ export class Viewer {
       this.frameMs = Number.NaN;
       return;
     }
+    stage.isIncomplete = this.state.labels.some(({ cells }) =>
+      cells.some((cell) => cell.visible && !cell.shown),
+    );
     const isDrawn = stage.draw(true);
     this.streamer.update(stage.viewpoint());
     if (!isDrawn) return;

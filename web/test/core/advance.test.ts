@@ -2,6 +2,7 @@
 
 import { expect, test } from "vitest";
 import { inAdvance } from "../../src/core/advance";
+import { Pack } from "../../src/core/pack";
 import { Network, VirtualClock } from "../simulate";
 import { world } from "../world";
 import { BASE } from "../worlds";
@@ -12,22 +13,24 @@ function made() {
   const clock = new VirtualClock();
   const network = new Network(clock);
   network.files.set("a.pack", Uint8Array.of(1, 2, 3));
-  return { clock, network, advance: inAdvance(network.fetch, url("a.pack")) };
+  return { clock, network, advance: inAdvance(network.fetch, url("a.pack"), 2) };
 }
+
+const BEGINNING = { headers: { Range: "bytes=0-1" } };
 
 test("who asks first gets the answer that is on its way, others their own", async () => {
   const { clock, network, advance } = made();
   await clock.pass(90);
   let [first, second] = ["", ""];
-  void advance.fetch(url("a.pack")).then(async (reply) => {
+  void advance.fetch(url("a.pack"), BEGINNING).then(async (reply) => {
     expect(reply.isEarly).toBe(true);
     first = await reply.text();
   });
-  void advance.fetch(url("a.pack")).then(async (reply) => {
+  void advance.fetch(url("a.pack"), BEGINNING).then(async (reply) => {
     second = await reply.text();
   });
   await clock.pass(20);
-  expect([first, second]).toEqual(["\x01\x02\x03", ""]);
+  expect([first, second]).toEqual(["\x01\x02", ""]);
   await clock.pass(100);
   expect(second).toBe(first);
   expect(network.asked).toEqual(["a.pack", "a.pack"]);
@@ -38,15 +41,26 @@ test.each<["offline" | 404]>([["offline"], [404]])(
   async (fault) => {
     const { clock, network } = made();
     network.faults.set("a.pack", [fault]);
-    const advance = inAdvance(network.fetch, url("a.pack"));
+    const advance = inAdvance(network.fetch, url("a.pack"), 2);
     let text = "";
-    void advance.fetch(url("a.pack")).then(async (reply) => {
+    void advance.fetch(url("a.pack"), BEGINNING).then(async (reply) => {
       text = await reply.text();
     });
     await clock.pass(300);
-    expect(text).toBe("\x01\x02\x03");
+    expect(text).toBe("\x01\x02");
   },
 );
+
+test("another part of it is asked for by itself", async () => {
+  const { clock, network, advance } = made();
+  let text = "";
+  void advance.fetch(url("a.pack"), { headers: { Range: "bytes=0-0" } }).then(async (reply) => {
+    text = await reply.text();
+  });
+  await clock.pass(300);
+  expect(text).toBe("\x01");
+  expect(network.askedRanges).toEqual(["a.pack 0-1", "a.pack 0-0"]);
+});
 
 test("nobody wants it: it is stopped; who has it stops it", async () => {
   const one = made();
@@ -55,7 +69,7 @@ test("nobody wants it: it is stopped; who has it stops it", async () => {
   expect(one.network.aborted).toEqual(["a.pack"]);
   const two = made();
   const abort = new AbortController();
-  two.advance.fetch(url("a.pack"), { signal: abort.signal }).catch(() => {});
+  two.advance.fetch(url("a.pack"), { ...BEGINNING, signal: abort.signal }).catch(() => {});
   two.advance.cancel();
   await two.clock.pass(10);
   expect(two.network.aborted).toEqual([]);
@@ -68,7 +82,8 @@ test("a bundle is drawn a round trip earlier", async () => {
   const firstDrawn = async (early: boolean) => {
     const w = world({ labels: 2, levels: 3, pack: true, streams: true });
     const { network, clock, manifest } = w;
-    const fetch = early ? inAdvance(network.fetch, url("scene-1.pack")).fetch : network.fetch;
+    const bytes = new Pack(manifest).beginning.reduce((sum, file) => sum + file.bytes, 0);
+    const fetch = early ? inAdvance(network.fetch, url("scene-1.pack"), bytes).fetch : network.fetch;
     await clock.pass(100); // the manifest's
     const { streamer } = world({}, { manifest, fetch }, w);
     const begun = clock.now();

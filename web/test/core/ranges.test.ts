@@ -112,7 +112,7 @@ test("an evicted level comes back without being loaded again", async () => {
   expect(w.renderer.decoded).toBe(decoded + 15);
 });
 
-test("with a pack, ranges bring what it would bring too late", async () => {
+test("with a pack, too", async () => {
   const { w } = made({ levels: 8, pack: true });
   w.network.bandwidth = 100_000;
   w.streamer.start();
@@ -123,22 +123,21 @@ test("with a pack, ranges bring what it would bring too late", async () => {
   expect(state.message).toBeNull();
 });
 
-test("without promises the pack brings what is planned so far, and about a round trip more", async () => {
+test("without promises the pack brings what holds for all viewpoints", async () => {
   const { w } = made({ labels: 6, levels: 16, pack: true });
   w.network.faults.set("promises-1.json", "hang");
   w.set({ mode: "target", target: 0.5 });
   w.network.bandwidth = 200_000;
   w.streamer.start();
-  await w.pass(9000);
+  await w.pass(20_000);
   const { state } = w.streamer;
   expect(shown(state)).toEqual(wanted(state));
-  expect(w.network.aborted).toContain("scene-1.pack");
   const planned = state.labels.reduce((sum, { bytes }) => sum + bytes, 0);
   expect(planned).toBeLessThan(w.manifest.totals.bytes / 2);
   expect(state.bytesLoaded).toBeLessThan(planned + 2 * w.network.bandwidth * 0.1);
 });
 
-test("the pack stops before a long way of what nobody wants", async () => {
+test("the pack brings nothing that nobody wants", async () => {
   const { w } = made({ labels: 6, levels: 16, pack: true });
   w.network.bandwidth = 200_000;
   await w.run({
