@@ -1,6 +1,7 @@
 """Our rows: equal levels, and what the planner takes for each frame within a budget."""
 
 import gzip
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -9,10 +10,11 @@ import numpy as np
 from benchmarks.runtime.measure import Shown
 from sagesplat.adapt.cell_plans import within
 from sagesplat.adapt.fidelity import References
-from sagesplat.formats.increments import INDEX, shown
+from sagesplat.formats.increments import shown
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.scene import Camera
+from sagesplat.stages.bundle import bundle
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import increments_of
 
@@ -49,7 +51,7 @@ class Levels:
         self._references, self._counts, self._ids = references, job.by_cell.counts, job.cells.ids.tolist()
         listed = increments_of(job)
         self.piece_bytes = np.array([one.nbytes for one in listed])
-        self.index_bytes = index_bytes(job.run)
+        self.index_bytes = index_bytes(job)
         at = {id(one): i for i, one in enumerate(listed)}
         self._pieces = {
             (cell, level): [at[id(one)] for one in shown(listed, cell, level)]
@@ -84,10 +86,9 @@ def planned(
     return Levels(name, job, references, (*shares, *shares), ours(job, cameras, shares))
 
 
-def index_bytes(run: RunDir) -> int:
+def index_bytes(job: Job) -> int:
     """What a viewer of ours reads before it plans, compressed as servers do: manifest and models."""
-    bundle = run.path / "bundle"
-    files = [bundle / "manifest.json", *sorted(bundle.glob("promises-*.json"))]
-    if not files[0].exists():
-        files = [run.increments / INDEX, run.fidelity]
-    return sum(len(gzip.compress(file.read_bytes())) for file in files)
+    with tempfile.TemporaryDirectory() as work:
+        out = bundle(job, Path(work) / "bundle").path
+        files = [out / "manifest.json", *out.glob("promises-*.json")]
+        return sum(len(gzip.compress(file.read_bytes())) for file in files)

@@ -83,6 +83,7 @@ EXCEPTIONS: dict[str, str] = {
     "viewer.bundle:_put_up": OURS,
     "viewer.built:has_viewer": OURS,
     "viewer.bundle:verified_files": _HASHED,
+    "viewer.manifest:_palettes": _HASHED,
     "viewer.bundle:write_documents": OURS,
     "viewer.single_file:_decoder": OURS,
     "viewer.single_file:_is_ours": _HASHED,

@@ -121,7 +121,7 @@ def _code(coder: Coder, degree: int, count: int, given: np.ndarray | None) -> np
 def _hashes(harmonics: np.ndarray) -> np.ndarray:
     """A number of 64 bits for each row; those of different rows differ, but for chance."""
     found = np.zeros(len(harmonics), np.uint64)
-    for column in harmonics.reshape(len(harmonics), -1).T:
+    for column in harmonics.reshape(len(harmonics), 3 * harmonics.shape[1]).T:
         found = (found ^ column.astype(np.uint64)) * np.uint64(_MULTIPLIER)
         found ^= found >> np.uint64(29)
     return found
