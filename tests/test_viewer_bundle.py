@@ -32,7 +32,7 @@ from sagesplat.adapt.cells import POINTS, Cells, describe_cells
 from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, ViewModel
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.increments import write_increments
+from sagesplat.formats.increments import totals, write_increments
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
 from sagesplat.formats.stream_header import AS_GIVEN
@@ -477,7 +477,18 @@ def test_a_palette_is_the_first_range_of_its_file(tmp_path, contents, viewer) ->
         replaces=dict.fromkeys(counts, (2,)), last=AS_GIVEN[1],
     )  # fmt: skip
     write_bundle(tmp_path / "out", replace(contents, chunks=made.increments), viewer)
-    for label in manifest_of(tmp_path / "out")["labels"]:
+    manifest = manifest_of(tmp_path / "out")
+    sent = totals(made.increments, sorted(counts), 3, "nbytes")
+    first = totals([replace(one, offset=0) for one in made.increments], sorted(counts), 3, "nbytes")
+    palettes = [label["palette"]["bytes"] for label in manifest["labels"]]
+    assert (sent[:, 0] == first[:, 0]).all()
+    for column in (
+        1,
+        2,
+    ):  # from the level that replaces on, its part of the palette
+        assert sum(palettes) <= (sent - first)[:, column].sum() < sum(palettes) + len(counts)
+    assert 0 <= sent[:, -1].sum() - manifest["totals"]["bytes"] < len(counts)
+    for label in manifest["labels"]:
         palette, levels = label["palette"], [one for cell in label["cells"] for one in cell["levels"]]
         content = (tmp_path / "out" / palette["uri"]).read_bytes()
         assert {one["uri"] for one in levels} == {palette["uri"]}

@@ -242,8 +242,9 @@ def full_scene(listed: Sequence[Increment]) -> list[Increment]:
 def totals(listed: Sequence[Increment], cells: Sequence[int], levels: int, what: str) -> np.ndarray:
     """Sums of a field over the increments that make up each level: int64 [C, K].
 
-    Rows are `cells`, columns the levels 1 to K; `what` is count, nbytes or gpu_bytes. DataError for an
-    increment of another cell or level.
+    Rows are `cells`, columns the levels 1 to K; `what` is count, nbytes or gpu_bytes. A file's palette is
+    divided evenly among its cells, at the levels that need it: from the last that replaces those below on.
+    DataError for an increment of another cell or level.
     """
     table, replaced = np.zeros((2, len(cells), levels), np.int64)
     row = {cell: i for i, cell in enumerate(cells)}
@@ -256,4 +257,24 @@ def totals(listed: Sequence[Increment], cells: Sequence[int], levels: int, what:
         table[at] += getattr(increment, what)
         replaced[at] |= increment.refine == "REPLACE"
     ends = table.cumsum(1)
-    return ends - np.maximum.accumulate(np.where(replaced, ends - table, 0), axis=1)
+    found = ends - np.maximum.accumulate(np.where(replaced, ends - table, 0), axis=1)
+    if what == "nbytes":
+        for of_file in _files(listed):
+            among = sorted({row[increment.cell] for increment in of_file})
+            share = -(-min(increment.offset for increment in of_file) // len(among))
+            for at in among:
+                found[at, np.flatnonzero(replaced[at]).max(initial=0) :] += share
+    return found
+
+
+def palettes_of(listed: Sequence[Increment]) -> dict[str, int]:
+    """Bytes of the palette of each file that has one, by uri: what comes before its first increment."""
+    found = {of_file[0].uri: min(one.offset for one in of_file) for of_file in _files(listed)}
+    return {uri: nbytes for uri, nbytes in found.items() if nbytes}
+
+
+def _files(listed: Sequence[Increment]) -> list[list[Increment]]:
+    by_uri: dict[str, list[Increment]] = {}
+    for increment in listed:
+        by_uri.setdefault(increment.uri, []).append(increment)
+    return list(by_uri.values())

@@ -15,7 +15,7 @@ from sagesplat.adapt.renders import Renders
 from sagesplat.core.config import AdoptConfig, NestConfig
 from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.formats.increments import full_scene, read_increments
+from sagesplat.formats.increments import full_scene, palettes_of, read_increments
 from sagesplat.formats.levels import write_set
 from sagesplat.formats.stream_header import AS_GIVEN, Precision, rounded
 from sagesplat.formats.stream_increments import write_streams
@@ -206,8 +206,8 @@ def _write(
     if not lossless and (other := sum(one.format != "stream" for one in made.increments)):
         job.emit(Warned(f"{other} files are PLY: some of their Gaussians lie too far off to be rounded"))
     write_cells(run.cells, describe_cells(sent, dict(label_of)))
-    everything = sum((run.increments / uri).stat().st_size for uri in {one.uri for one in made.increments})
-    palettes = everything - sum(one.nbytes for one in made.increments)  # which are in no increment
+    palettes = sum(palettes_of(made.increments).values())
+    everything = sum(one.nbytes for one in made.increments) + palettes
     shown = sum(one.nbytes for one in full_scene(made.increments)) + palettes
     if ssim < KEPT and not lossless:
         job.emit(

@@ -19,7 +19,7 @@ from sagesplat import __version__
 from sagesplat.adapt.cell_models import FidelityModel
 from sagesplat.adapt.cells import STEPS, Cells
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
-from sagesplat.formats.increments import Increment, full_scene
+from sagesplat.formats.increments import Increment, full_scene, palettes_of
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import frames
 from sagesplat.viewer.frames import FLIP
@@ -168,7 +168,7 @@ def documents(
         "background": [round(c / 255, 6) for c in contents.cameras[0].camera.background],
         "totals": {
             "count": sum(chunk.count for chunk in full),
-            "bytes": sum(chunk.nbytes for chunk in full),
+            "bytes": sum(chunk.nbytes for chunk in full) + sum(one["bytes"] for one in palettes.values()),
             "gpuBytes": sum(chunk.gpu_bytes for chunk in full),
         },
         **({} if contents.ladder is None else {"ladder": contents.ladder}),
@@ -254,17 +254,12 @@ def _cells(contents: Contents) -> dict[int, list[dict[str, Any]]]:
 
 def _palettes(contents: Contents) -> dict[int, dict[str, Any]]:
     """By label id, the entries of the palettes: what comes before the first stream of a file."""
-    firsts: dict[str, Increment] = {}
-    for chunk in sorted(contents.chunks, key=lambda chunk: chunk.offset):
-        firsts.setdefault(chunk.uri, chunk)
+    label_of = {chunk.uri: chunk.label_id for chunk in contents.chunks}
     found = {}
-    for uri, first in firsts.items():
-        if first.offset:
-            with (contents.folder / uri).open("rb") as file:
-                digest = hashlib.sha256(file.read(first.offset)).hexdigest()
-            found[first.label_id] = {
-                "uri": f"chunks/{uri}", "offset": 0, "bytes": first.offset, "sha256": digest,
-            }  # fmt: skip
+    for uri, nbytes in palettes_of(contents.chunks).items():
+        with (contents.folder / uri).open("rb") as file:
+            digest = hashlib.sha256(file.read(nbytes)).hexdigest()
+        found[label_of[uri]] = {"uri": f"chunks/{uri}", "offset": 0, "bytes": nbytes, "sha256": digest}
     return found
 
 

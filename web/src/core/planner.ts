@@ -44,8 +44,16 @@ type Unit = (typeof UNITS)[number];
 export const LEAST_SHARE = 1e-4;
 const SLACK = 0.01; // least gain of quality for which a budget's levels are left
 
-/** Costs of levels as sums over their increments, from the newest that replaces those below. */
-export function ladderOf({ levels }: { readonly levels: readonly Level[] }): Ladder {
+/**
+ * Costs of levels as sums over their increments, from the newest that replaces those below.
+ *
+ * @param palette - bytes of the cell's part in one, which the levels from the last that replaces on need
+ */
+export function ladderOf({ levels }: { readonly levels: readonly Level[] }, palette = 0): Ladder {
+  const first = Math.max(
+    levels.findLastIndex(({ refine }) => refine),
+    0,
+  );
   const sums = (unit: Unit) => {
     let sum = 0;
     return levels.map((level) => {
@@ -53,7 +61,8 @@ export function ladderOf({ levels }: { readonly levels: readonly Level[] }): Lad
       return sum;
     });
   };
-  return { bytes: sums("bytes"), gpuBytes: sums("gpuBytes"), count: sums("count") };
+  const bytes = sums("bytes").map((sum, k) => (k < first ? sum : sum + palette));
+  return { bytes, gpuBytes: sums("gpuBytes"), count: sums("count") };
 }
 
 /** Weight of a cell at this viewpoint. */

@@ -35,7 +35,7 @@ export class Entry {
     public label: Label,
     public cell: Cell,
   ) {
-    this.ladder = ladderOf(cell);
+    this.ladder = ladderOf(cell, Math.ceil((label.palette?.bytes ?? 0) / label.cells.length));
     this.points = new Points(cell);
     this.replaces = cell.levels.some(({ refine }) => refine);
     this.decoded = cell.levels.map(() => undefined);

@@ -25,6 +25,7 @@ test("a level costs what it holds", () => {
   if (!cell) throw new Error("no cell");
   const [a = 0, b = 0, c = 0, d = 0, e = 0] = cell.levels.map(({ bytes }) => bytes);
   expect(ladderOf(cell).bytes).toEqual([a, b, b + c, d, d + e]);
+  expect(ladderOf(cell, 7).bytes).toEqual([a, b, b + c, d + 7, d + e + 7]); // its part of a palette
 });
 
 test("above a level that replaces, the first comes first, and those between are never fetched", async () => {
