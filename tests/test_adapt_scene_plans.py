@@ -1,6 +1,7 @@
 """Plans for all viewpoints of a scene: the share that holds, few views, photos of training."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagesplat.adapt.bound_plans import Costs, pooled
-from sagesplat.adapt.scene_plans import plan_for_scene, raise_failing_levels, reached
+from sagesplat.adapt.scene_plans import never_dearer, plan_for_scene, raise_failing_levels, reached
 from sagesplat.core.errors import RunError
 
 quick = settings(max_examples=80)
@@ -47,6 +48,21 @@ def test_the_cheapest_level_that_the_share_of_views_needs(views, target, share, 
         assert choice.reached.low <= holds <= choice.reached.high
         assert choice.predicted >= target
     assert (plan.quality, plan.view, plan.share, plan.status) == ("fidelity", None, share, "ok")
+
+
+def test_a_lower_target_costs_no_more_than_a_higher_one():
+    """Raising levels may go further for a lower target than planning by cell does for a higher one."""
+    low, high, ssim = (
+        plan_for_scene(draws(60, 2, 5, 0), np.zeros((60, 2)), costs(2, 5), target, 0.95, kind)
+        for target, kind in ((0.25, "fidelity"), (0.35, "fidelity"), (0.9, "ssim"))
+    )
+    assert never_dearer([low, high, ssim]) == [low, high, ssim]
+    full = plan_for_scene(draws(60, 2, 5, 0), np.zeros((60, 2)), costs(2, 5), 1.0, 0.95, "fidelity")
+    raised = replace(low, choices=full.choices)
+    found = never_dearer([raised, high, ssim])
+    assert found == [replace(low, choices=high.choices), high, ssim]
+    unproven = replace(high, choices=tuple(replace(one, calibrated=False) for one in high.choices))
+    assert never_dearer([raised, unproven])[0] == raised
 
 
 def test_it_holds_in_the_asked_share_of_new_views():

@@ -204,7 +204,7 @@ def evaluate(
             })  # fmt: skip
     known_compositions: dict[str, list[tuple[int, dict[int, dict[str, float]], dict[int, float]]]] = {}
     for plan in plans:
-        same = repr(plan) if compose else repr((plan.levels, plan.cells))
+        same = repr((plan.levels, plan.cells, (plan.quality, plan.target) if compose else None))
         if same not in known_compositions:  # low targets often have one plan
             composed = compose(plan) if compose else plan.compose(ladder)
             known_compositions[same] = list(measure_all(composed, others))

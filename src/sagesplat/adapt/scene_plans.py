@@ -12,6 +12,7 @@ so it is measured at further viewpoints; where fewer than the share keep the tar
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -139,6 +140,24 @@ def measured_in_composition(
                 missed[choice.label_id] = plan.target - least
         choices.append(choice)
     return replace(plan, choices=tuple(choices)), missed
+
+
+def never_dearer(plans: Sequence[Plan]) -> list[Plan]:
+    """Plans of a scene; those for fidelity take the levels of one for a higher target that costs less."""
+    found = []
+    for plan in plans:
+        higher = [
+            other
+            for other in plans
+            if (other.quality, other.share) == (plan.quality, plan.share)
+            and plan.quality == "fidelity"
+            and other.target > plan.target
+            and [choice.status for choice in other.choices] == [choice.status for choice in plan.choices]
+            and all(choice.calibrated is not False for choice in other.choices)
+        ]
+        best = min([plan, *higher], key=lambda one: one.transfer_bytes or 0)
+        found.append(replace(plan, choices=best.choices, cells=best.cells))
+    return found
 
 
 def _at_level(costs: Costs, choice: Choice, column: int) -> Choice:

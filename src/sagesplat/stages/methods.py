@@ -25,7 +25,12 @@ from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan
 from sagesplat.adapt.scene_cells import thinned
-from sagesplat.adapt.scene_plans import measured_in_composition, plan_for_scene, raise_failing_levels
+from sagesplat.adapt.scene_plans import (
+    measured_in_composition,
+    never_dearer,
+    plan_for_scene,
+    raise_failing_levels,
+)
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel, write_promises
 from sagesplat.adapt.viewpoints import in_words
 from sagesplat.core.config import FitConfig, LadderKind, PlanConfig
@@ -227,7 +232,7 @@ class NestedLevels(Method):
             }
             plans = [found[i][0] if i in found else plan for i, plan in enumerate(plans)]
             open_ones = [i for i in open_ones if not found[i][1]]
-        return plans
+        return never_dearer(plans)
 
     def _thinned(self, plans: Sequence[Plan], share: float, cameras: Sequence[Camera]) -> dict[int, Plan]:
         """Plans for fidelity by cell, by their place: those that hold in their compositions at `cameras`.
