@@ -25,9 +25,11 @@ class Coder(Protocol):
 
     def symbols(self, name: str, contexts: Int64[np.ndarray, " N"], values: np.ndarray | None) -> np.ndarray:
         """Symbols int64 [N], each by the row `contexts` of the table `name`."""
+        ...
 
     def bits(self, widths: Int64[np.ndarray, " N"], values: np.ndarray | None) -> np.ndarray:
         """Values int64 [N] of `widths` bits each, all equally likely, at most 14."""
+        ...
 
     def end_block(self) -> None:
         """Count what was coded since the last block."""

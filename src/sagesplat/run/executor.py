@@ -33,6 +33,7 @@ class Executor(Protocol):
     @property
     def parallel(self) -> int:
         """How many tasks run at once; a stage divides its work by it."""
+        ...
 
     @property
     def backend(self) -> Literal["cuda"] | None:
@@ -41,12 +42,14 @@ class Executor(Protocol):
     @property
     def memory(self) -> int:
         """Bytes of a node's memory that are a task's share (0: all that its machine has)."""
+        ...
 
     def run(self, tasks: Sequence[Task], emit: Emit) -> Iterator[tuple[int, Any]]:
         """The result of each task with its number, as they come; events of the tasks go to `emit`.
 
         The first SageError of a task ends all of them.
         """
+        ...
 
 
 class Local:

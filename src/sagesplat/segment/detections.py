@@ -42,6 +42,7 @@ class Finder(Protocol):
 
     def __call__(self, photo: UInt8[np.ndarray, "H W 3"], /) -> Found:
         """What is in a photo."""
+        ...
 
 
 def without_duplicates(boxes: Boxes) -> Boxes:

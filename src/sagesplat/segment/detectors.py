@@ -24,6 +24,7 @@ class Scorer(Protocol):
 
     def __call__(self, inputs: Any, /) -> tuple[Float32[Tensor, "Q P"], Float32[Tensor, "Q 4"]]:
         """Scores for each prompt; boxes as centre, width and height, as parts of the network's input."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,7 @@ class Segmenter(Protocol):
 
     def __call__(self, photos: Sequence[UInt8[np.ndarray, "H W 3"]], /) -> list[Segmented]:
         """An answer for each photo; those of one call may be computed together."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -91,9 +91,10 @@ def _check_run(run: RunDir, config: AdoptConfig) -> None:
     check_not_edited(run)
     if run.scene.exists() and not run.adopted.exists():
         raise RunError(f"{run.path}: holds a run of its own; choose a new folder for the splat")
-    cameras = None if config.cameras is None else config.cameras.resolve()
-    ours = cameras is not None and cameras.is_relative_to(run.path.resolve())
-    if ours and not cameras.is_relative_to(run.from_python.resolve()):
+    if config.cameras is None:
+        return
+    cameras, given = config.cameras.resolve(), run.from_python.resolve()
+    if cameras.is_relative_to(run.path.resolve()) and not cameras.is_relative_to(given):
         raise RunError(
             f"{config.cameras}: in the run folder, where adopt writes; copy it elsewhere, and give that path"
         )

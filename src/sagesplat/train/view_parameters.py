@@ -70,6 +70,7 @@ class ViewUpdate(Protocol):
     @property
     def first_step(self) -> int:
         """The step from which on gradients of the parameters are taken."""
+        ...
 
     def __call__(
         self, parameters: ViewParameters, views: Sequence[int], grad: Float32[Tensor, "R D"], step: int
