@@ -2,8 +2,8 @@
 
 Frames are drawn by the CPU here, whose time grows with the splats and the pixels. Of the same scene with and
 without cells the page shows the plan for the same fidelity, from the same views. For the turn the page has
-come to rest at a view, then turns by a right angle over a slow network. Half a second later the levels that
-it draws are rendered here, beside those that it draws in the end.
+come to rest at a view, then turns by a right angle over a slow network. Half a second and two frames later
+the levels that it draws are rendered here, beside those that it draws in the end.
 """
 
 import threading
@@ -58,7 +58,7 @@ def frame_times(job: Job, opened: Opened, camera: Camera) -> tuple[float, int]:
 
 
 def turned(job: Job, opened: Opened, camera: Camera) -> dict[str, float]:
-    """Fidelity half a second after a turn to the right from a view, and at rest."""
+    """Fidelity half a second and two frames (`SAMPLE`) after a turn to the right from a view, and at rest."""
     right = np.eye(4, dtype=np.float32)
     right[:3, :3] = Rotation.from_euler("y", -90, degrees=True).as_matrix()
     after = replace(camera, w2c=right @ camera.w2c)
@@ -98,7 +98,7 @@ def main(
     mbit: float = 10.0,
     write: bool = False,
 ) -> None:
-    """Milliseconds a frame with and without cells, and the fidelity half a second after a turn of the head.
+    """Milliseconds a frame with and without cells, and the fidelity soon after a turn of the head.
 
     Args:
         run: folder of a run with a bundle.
@@ -134,7 +134,7 @@ def main(
         for name, found in result[f"{target:g}"].items():
             print(f"{target:g} {name}: {found['ms']:.1f} ms a frame, {found['splats']:,.0f} splats drawn")
     shares = [turn["soon"] / turn["rest"] for turn in turns]
-    print(f"turn at {mbit:g} Mbit/s: {min(shares):.3f} to {max(shares):.3f} of its fidelity after 0.5 s")
+    print(f"turn at {mbit:g} Mbit/s: {min(shares):.3f} to {max(shares):.3f} after 0.5 s and two frames")
     finish("frames", result, write)
 
 

@@ -143,7 +143,10 @@ def measured_in_composition(
 
 
 def never_dearer(plans: Sequence[Plan]) -> list[Plan]:
-    """Plans of a scene; those for fidelity take the levels of one for a higher target that costs less."""
+    """Plans of a scene; those for fidelity take the choices of one for a higher target that costs less.
+
+    What these say is reached is the share of the higher target: at least as much reaches the lower one.
+    """
     found = []
     for plan in plans:
         higher = [

@@ -168,9 +168,6 @@ def computing(machine: Machine, folder: Path) -> "Iterator[tuple[Backend, int, E
 
 def prepare(machine: Machine) -> "tuple[Backend, int]":
     """The backend that this machine computes with, and its CPU threads."""
-    from sagesplat.raster import cuda, resolve_backend, set_threads
+    from sagesplat.raster import prepared
 
-    device = machine.device
-    if device == "auto" and cuda.missing() is None:
-        device = "cuda"
-    return resolve_backend("auto", device), set_threads(machine.threads)
+    return prepared(machine.device, threads=machine.threads)

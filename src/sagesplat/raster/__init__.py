@@ -50,6 +50,18 @@ def resolve_backend(backend: Backend, device: str = "auto") -> Backend:
     return backend
 
 
+def prepared(device: str = "auto", backend: Backend = "auto", threads: int = 0) -> tuple[Backend, int]:
+    """What this machine computes with, a GPU where one works and nothing else is asked for; sets the threads.
+
+    As `resolve_backend` and `set_threads`.
+    """
+    from sagesplat.raster import cuda
+
+    if (device, backend) == ("auto", "auto") and cuda.missing() is None:
+        device = "cuda"
+    return resolve_backend(backend, device), set_threads(threads)
+
+
 def device_of(backend: Backend, rank: int = 0) -> torch.device:
     """Where a backend computes; with several GPUs, the one of a process."""
     return torch.device("cuda", rank) if backend == "cuda" else torch.device("cpu")

@@ -20,7 +20,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Event
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.text_table import aligned
-from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
+from sagesplat.raster import Backend, prepared, resolve_backend, set_threads
 from sagesplat.run.job import NO_RUN, Job
 from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.scene.scene import Camera, Scene
@@ -90,9 +90,7 @@ def _working(
     run: RunDir, on_event: Emit, device: str, backend: Backend, threads: int, force: bool
 ) -> Iterator[Job]:
     """A job that works on a run folder, which nobody else writes into between two stages."""
-    if (device, backend) == ("auto", "auto") and cuda.missing() is None:
-        device = "cuda"
-    backend, threads = resolve_backend(backend, device), set_threads(threads)
+    backend, threads = prepared(device, backend, threads)
     check_links(run.path)
     with ExitStack() as locks:
         yield Job(run, on_event, backend, threads, force, device=device, locks=locks)

@@ -245,7 +245,8 @@ class NestedLevels(Method):
             return found
         sampled = sampled_of(job)
         shown = sampled.by_label(label_of).shown()
-        pixels = sampled.pixels * shown[:, np.unique(job.cells.labels, return_inverse=True)[1]]
+        counted = shown[:, np.unique(job.cells.labels, return_inverse=True)[1]]
+        pixels = np.where(counted, sampled.pixels, 0.0)
         reaching = {
             i: {c.label_id: plan.target for c in plan.choices if c.status == "ok"}
             for i, plan in enumerate(plans)

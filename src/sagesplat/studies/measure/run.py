@@ -19,7 +19,7 @@ from sagesplat.io.typed import check_limits
 from sagesplat.metrics import flip
 from sagesplat.metrics.image import ssim_map
 from sagesplat.output.contact_sheet import contact_sheet
-from sagesplat.raster import Backend, cuda, resolve_backend, set_threads
+from sagesplat.raster import Backend, prepared
 from sagesplat.scene.cameras import read_camera_file
 from sagesplat.scene.scene import Camera
 from sagesplat.studies.lpips import load_metrics
@@ -72,9 +72,7 @@ def measure_levels(
         >>> from sagesplat import measure_levels
         >>> print(measure_levels("runs/garden"))  # doctest: +SKIP
     """
-    if (device, backend) == ("auto", "auto") and cuda.missing() is None:
-        device = "cuda"
-    backend, _ = resolve_backend(backend, device), set_threads(threads)
+    backend, _ = prepared(device, backend, threads)
     some = levels if isinstance(levels, Sequence) and not isinstance(levels, str) else [levels]
     return _measure([reference, *some], Path(out), config, on_event, backend)
 
