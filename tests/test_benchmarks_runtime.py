@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.runtime import __main__ as runtime
 from benchmarks.runtime import playcanvas, spark
-from benchmarks.runtime.levels import opened, ours
+from benchmarks.runtime.levels import Pieces, for_targets, opened, within_budgets
 from benchmarks.runtime.measure import fidelity
 from benchmarks.runtime.walk import recorded
 from sagesplat.adapt.observe import render_rgb
@@ -167,12 +167,30 @@ def test_a_run_is_measured_on_the_same_walk_each_time(finished_run, tmp_path, ca
     job = opened(finished_run)
     cameras = recorded(job, walk, 5, 1.0, 40)
     assert walk.read_bytes() == made
+    asked = methods["ours"]["asked"]
+    assert [one["target"] for one in asked] == list(runtime.TARGETS)
+    assert 0.8 < asked[2]["kept"] <= 1
+    assert asked[2]["kept_lowest"] <= asked[2]["kept"]
+    assert asked[2]["first_bytes"] <= asked[2]["bytes"]
     shares = (0.05, 0.3, 1.0)
-    levels, counts = ours(job, cameras, shares), NestedLevels(job).cell_costs.count
-    assert levels.shape == (3, 2 * len(shares), len(job.cells.ids))
-    assert (np.diff(levels[:, :3].sum(2), axis=1) >= 0).all()
-    taken = counts[np.arange(levels.shape[2]), levels[:, :3] - 1].sum(2)
+    levels, counts = within_budgets(job, cameras, shares), NestedLevels(job).cell_costs.count
+    assert levels.shape == (3, len(shares), len(job.cells.ids))
+    assert (np.diff(levels.sum(2), axis=1) >= 0).all()
+    taken = counts[np.arange(levels.shape[2]), levels - 1].sum(2)
     assert (taken <= np.maximum(np.array(shares) * counts[:, -1].sum(), counts[:, 0].sum())).all()
+
+
+def test_what_has_come_counts_in_all_levels_that_hold_it(finished_run):
+    job = opened(finished_run)
+    pieces, costs = Pieces(job), NestedLevels(job).cell_costs.transfer_bytes
+    np.testing.assert_array_equal(pieces.among(np.ones(len(pieces.nbytes), bool)), costs)
+    assert not pieces.among(np.zeros(len(pieces.nbytes), bool)).any()
+    first = pieces.of_composition(dict.fromkeys(job.cells.ids.tolist(), 1))
+    np.testing.assert_array_equal(pieces.among(first), np.broadcast_to(costs[:, :1], costs.shape))
+    camera = job.scene.views[0].camera.neutral
+    levels = for_targets(job, pieces, [camera, camera], (0.8, 0.95))
+    np.testing.assert_array_equal(levels[0], levels[1])
+    assert (levels[0, 0] <= levels[0, 1]).all()
 
 
 def test_streamed_sog_of_playcanvas_is_drawn_by_its_budget(finished_run, tmp_path):
@@ -186,7 +204,8 @@ def test_streamed_sog_of_playcanvas_is_drawn_by_its_budget(finished_run, tmp_pat
     )
     camera = job.scene.views[0].camera.neutral
     at = job.references.at(camera)
-    found = [(one, fidelity(one.image, at.image, at.label_ids)[0]) for one in method.shown(0, camera)]
+    ids = job.cells.ids
+    found = [(one, fidelity(one.image, at.image, at.label_ids, ids)[0]) for one in method.shown(0, camera)]
     counts = [one.count for one, _ in found]
     assert counts[0] == len(levels[1]) < counts[1] < counts[2] == len(levels[0])
     assert found[0][1] < found[1][1] < found[2][1] > 0.97

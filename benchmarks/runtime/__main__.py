@@ -18,6 +18,7 @@ from sagesplat.run.job import Job
 
 # of the full model's splats
 BUDGETS = (0.005, 0.01, 0.015, 0.025, 0.04, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
+TARGETS = (0.8, 0.85, 0.9, 0.93, 0.95, 0.97)
 FOLDER = Path(tempfile.gettempdir()) / "sagesplat-runtime"
 
 
@@ -39,7 +40,7 @@ def measure(
     cameras, references = recorded(job, folder / "walk.json", seed, screen, every), job.references
     methods: list[Method] = [
         equal_levels(job, references, len(cameras)),
-        planned("ours", job, references, cameras, BUDGETS),
+        planned("ours", job, references, cameras, BUDGETS, TARGETS),
     ]
     methods += rivals(job, folder, tools)
     print(f"{run.name}: {len(cameras)} frames at {cameras[0].width} x {cameras[0].height}")
@@ -48,7 +49,7 @@ def measure(
     found = walk(methods, job, cameras)
     if without:
         other = opened(without)
-        one_each = planned("ours without cells", other, other.references, cameras, BUDGETS)
+        one_each = planned("ours without cells", other, other.references, cameras, BUDGETS, TARGETS)
         found.insert(2, *walk([one_each], other, cameras))
     result = summary(found, job.ladder.size(job.ladder.levels[-1]), int(found[0].nbytes[0, -1]))
     print("\n".join(lines(result)))

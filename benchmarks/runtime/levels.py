@@ -1,15 +1,17 @@
-"""Our rows: equal levels, and what the planner takes for each frame within a budget."""
+"""Our rows: equal levels, and what the planner takes for each frame within a budget or for a target."""
 
 import gzip
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.runtime.measure import Shown
-from sagesplat.adapt.cell_plans import within
+from sagesplat.adapt.cell_plans import reach, within
 from sagesplat.adapt.fidelity import References
+from sagesplat.adapt.fidelity_models import needed
+from sagesplat.adapt.fill import fill
 from sagesplat.formats.increments import shown
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
@@ -18,46 +20,92 @@ from sagesplat.stages.bundle import bundle
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import increments_of
 
+# what a byte that has come counts in the next plan for a target, as in web/src/core/residency.ts
+THERE = 0.25
+
 
 def opened(run: Path) -> Job:
     """A finished run."""
     return Job(RunDir(run, "nested"), lambda event: None)
 
 
-def ours(job: Job, cameras: Sequence[Camera], shares: Sequence[float]) -> np.ndarray:
-    """The planner's levels of cells, int [F, 2 J, C] from 1 to K, within shares of all splats and bytes."""
+class Pieces:
+    """What is fetched as one of a run's levels."""
+
+    def __init__(self, job: Job):
+        listed = increments_of(job)
+        at = {id(one): i for i, one in enumerate(listed)}
+        self.nbytes = np.array([one.nbytes for one in listed])
+        self.of = {  # (cell, level) takes
+            (cell, level): [at[id(one)] for one in shown(listed, cell, level)]
+            for cell in job.cells.ids.tolist()
+            for level in job.ladder.levels
+        }
+        self.shape = len(job.cells.ids), len(job.ladder.levels)
+
+    def of_composition(self, levels: Mapping[int, int]) -> np.ndarray:
+        """Which ones levels by cell take, bool [P]."""
+        found = np.zeros(len(self.nbytes), bool)
+        for of_level in levels.items():
+            found[self.of[of_level]] = True
+        return found
+
+    def among(self, came: np.ndarray) -> np.ndarray:
+        """Bytes of some pieces in each level of each cell, int [C, K]."""
+        nbytes = self.nbytes * came
+        return np.array([nbytes[mine].sum() for mine in self.of.values()]).reshape(self.shape)
+
+
+def within_budgets(job: Job, cameras: Sequence[Camera], shares: Sequence[float]) -> np.ndarray:
+    """The planner's levels of cells, int [F, J, C] from 1 to K, within shares of all splats."""
     method = NestedLevels(job)
-    expected, costs = method.expect(cameras), method.cell_costs
-    budgets = [
-        (cost, share * float(cost[:, -1].sum()))
-        for cost in (costs.count, costs.transfer_bytes)
-        for share in shares
-    ]
+    expected, cost = method.expect(cameras), method.cell_costs.count
+    budgets = [share * float(cost[:, -1].sum()) for share in shares]
     return np.array(
         [
-            [within(cost, mean, share, budget) + 1 for cost, budget in budgets]
+            [within(cost, mean, share, budget) + 1 for budget in budgets]
             for mean, share in zip(expected.mean, expected.share, strict=True)
         ]
     )
+
+
+def for_targets(job: Job, pieces: Pieces, cameras: Sequence[Camera], targets: Sequence[float]) -> np.ndarray:
+    """The planner's levels of cells, int [F, J, C] from 1 to K, that keep targets in each category.
+
+    As in the viewer, what an earlier frame has fetched costs a part of its bytes (`THERE`).
+    """
+    method, ids = NestedLevels(job), job.cells.ids.tolist()
+    expected, full = method.expect(cameras), method.cell_costs.transfer_bytes.astype(np.float64)
+    found = np.zeros((len(cameras), len(targets), len(ids)), np.int64)
+    for j, target in enumerate(targets):
+        came = np.zeros(len(pieces.nbytes), bool)
+        for frame in range(len(cameras)):
+            here, cost = expected.at(frame), full - (1 - THERE) * pieces.among(came)
+            mean, share = here.mean[0], here.share[0]
+            least = needed(method.fidelity, here, target)[0]
+            levels = fill(reach(cost, mean, share, here.column, least).levels, mean, cost, share) + 1
+            found[frame, j] = levels
+            came |= pieces.of_composition(dict(zip(ids, levels.tolist(), strict=True)))
+    return found
 
 
 class Levels:
     """Levels of a ladder, [F, J, L]; a method of `measure`."""
 
     def __init__(
-        self, name: str, job: Job, references: References, settings: Sequence[float], levels: np.ndarray
+        self,
+        name: str,
+        job: Job,
+        references: References,
+        settings: Sequence[float],
+        levels: np.ndarray,
+        targets: Sequence[float] = (),
     ):
-        self.name, self.settings, self._levels = name, settings, levels
+        """`targets`: those of the last settings."""
+        self.name, self.settings, self.targets, self._levels = name, settings, targets, levels
         self._references, self._counts, self._ids = references, job.by_cell.counts, job.cells.ids.tolist()
-        listed = increments_of(job)
-        self.piece_bytes = np.array([one.nbytes for one in listed])
-        self.index_bytes = index_bytes(job)
-        at = {id(one): i for i, one in enumerate(listed)}
-        self._pieces = {
-            (cell, level): [at[id(one)] for one in shown(listed, cell, level)]
-            for cell in self._ids
-            for level in job.ladder.levels
-        }
+        self._pieces = Pieces(job)
+        self.piece_bytes, self.index_bytes = self._pieces.nbytes, index_bytes(job)
 
     def shown(self, frame: int, camera: Camera) -> Iterator[Shown]:
         """See `Method`."""
@@ -65,11 +113,8 @@ class Levels:
         assert seen is not None  # the ladder is nested
         for chosen in self._levels[frame].tolist():
             levels = dict(zip(self._ids, chosen, strict=True))
-            needed = np.zeros(len(self.piece_bytes), bool)
-            for of_level in levels.items():
-                needed[self._pieces[of_level]] = True
             count = sum(self._counts[of_level] for of_level in levels.items())
-            yield Shown(seen.render(levels), count, needed)
+            yield Shown(seen.render(levels), count, self._pieces.of_composition(levels))
 
 
 def equal_levels(job: Job, references: References, frames: int) -> Levels:
@@ -80,10 +125,16 @@ def equal_levels(job: Job, references: References, frames: int) -> Levels:
 
 
 def planned(
-    name: str, job: Job, references: References, cameras: Sequence[Camera], shares: Sequence[float]
+    name: str,
+    job: Job,
+    references: References,
+    cameras: Sequence[Camera],
+    shares: Sequence[float],
+    targets: Sequence[float],
 ) -> Levels:
-    """The planner's within shares of all splats, and of all bytes."""
-    return Levels(name, job, references, (*shares, *shares), ours(job, cameras, shares))
+    """The planner's within shares of all splats, and for targets of every category."""
+    levels = [within_budgets(job, cameras, shares), for_targets(job, Pieces(job), cameras, targets)]
+    return Levels(name, job, references, (*shares, *targets), np.concatenate(levels, 1), targets)
 
 
 def index_bytes(job: Job) -> int:

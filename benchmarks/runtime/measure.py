@@ -10,7 +10,6 @@ from sagesplat.adapt.fidelity import PROMISED_SHARE
 from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
-from sagesplat.segment.masks import UNLABELLED
 
 COUNTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4)  # of the full model's splats, at which methods meet
 SIZES = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)  # of our bytes of the full model: others take several times as many
@@ -33,6 +32,7 @@ class Method(Protocol):
     settings: Sequence[float]  # J, of its knob
     piece_bytes: np.ndarray  # int64 [P], of what is fetched as one, encoded
     index_bytes: int  # that come before anything else
+    targets: Sequence[float]  # of fidelity by category, of the last settings; none: not a promise
 
     def shown(self, frame: int, camera: Camera) -> Iterator[Shown]:
         """What is drawn at each setting."""
@@ -45,8 +45,9 @@ class Walked:
 
     name: str
     settings: tuple[float, ...]
+    targets: tuple[float, ...]  # of the last settings
     whole: np.ndarray  # [F, J], SSIM against the full model, of the whole image
-    lowest: np.ndarray  # [F, J], of the lowest category of at least PROMISED_SHARE of the pixels
+    by_category: np.ndarray  # [F, J, L]; NaN: less than PROMISED_SHARE of the pixels
     count: np.ndarray  # [F, J], splats
     nbytes: np.ndarray  # [F, J], fetched up to this frame
 
@@ -56,7 +57,8 @@ class Walked:
         Only of settings that no other one is better than, in the mean, with less.
         """
         x = self.count.mean(0) if over == "count" else self.nbytes[-1]
-        y = np.stack([self.whole.mean(0), np.quantile(self.whole, 0.05, axis=0), self.lowest.mean(0)])
+        lowest = np.fmin.reduce(self.by_category, axis=2)
+        y = np.stack([self.whole.mean(0), np.quantile(self.whole, 0.05, axis=0), np.nanmean(lowest, axis=0)])
         order = np.lexsort([-y[0], x])
         best = np.maximum.accumulate(y[0, order])
         rows = order[np.concatenate([[True], best[1:] > best[:-1]])]
@@ -70,6 +72,26 @@ class Walked:
         x, y = self.curve(over)
         return np.stack([np.interp(np.log(at), np.log(x), row, left=np.nan) for row in y])
 
+    def kept(self) -> list[dict[str, float]]:
+        """What each target came to."""
+        first, rows = len(self.settings) - len(self.targets), []
+        for j, target in enumerate(self.targets, first):
+            of_category = self.by_category[:, j]
+            seen = np.isfinite(of_category)
+            by_label = [(of_category[seen[:, i], i] >= target).mean() for i in np.flatnonzero(seen.any(0))]
+            rows.append(
+                {
+                    "target": target,
+                    "kept": float((of_category[seen] >= target).mean()),
+                    "kept_lowest": float(min(by_label)),
+                    "whole": float(self.whole[:, j].mean()),
+                    "count": float(self.count[:, j].mean()),
+                    "first_bytes": float(self.nbytes[0, j]),
+                    "bytes": float(self.nbytes[-1, j]),
+                }
+            )
+        return rows
+
     def first_bytes(self) -> float:
         """Fewest bytes with which the first view reaches FIDELITY; inf: it never does."""
         enough = self.nbytes[0][self.whole[0] >= FIDELITY]
@@ -80,31 +102,35 @@ def walk(methods: Sequence[Method], job: Job, cameras: Sequence[Camera]) -> list
     """Measure every frame of every method at every setting, against the run's full model."""
     references = job.references
     ids, labels = job.cells.ids, job.cells.labels
-    tables = [np.zeros((4, len(cameras), len(method.settings))) for method in methods]
+    tables = [np.zeros((3, len(cameras), len(method.settings))) for method in methods]
+    names = np.unique(labels)
+    of_categories = [np.full((*table.shape[1:], len(names)), np.nan) for table in tables]
     fetched = [np.zeros((len(method.settings), len(method.piece_bytes)), bool) for method in methods]
     for frame, camera in enumerate(cameras):
         at = references.at(camera)
         known = at.label_ids >= ids[0]
         label_ids = np.where(known, labels[np.searchsorted(ids, np.where(known, at.label_ids, ids[0]))], -1)
-        for method, table, have in zip(methods, tables, fetched, strict=True):
+        for method, table, own, have in zip(methods, tables, of_categories, fetched, strict=True):
             for j, shown in enumerate(method.shown(frame, camera)):
                 have[j] |= shown.needed
                 sent = method.index_bytes + int(method.piece_bytes[have[j]].sum())
-                table[:, frame, j] = *fidelity(shown.image, at.image, label_ids), shown.count, sent
+                whole, own[frame, j] = fidelity(shown.image, at.image, label_ids, names)
+                table[:, frame, j] = whole, shown.count, sent
     return [
-        Walked(method.name, tuple(method.settings), *table)
-        for method, table in zip(methods, tables, strict=True)
+        Walked(method.name, tuple(method.settings), tuple(method.targets), table[0], own, *table[1:])
+        for method, table, own in zip(methods, tables, of_categories, strict=True)
     ]
 
 
-def fidelity(image: np.ndarray, full: np.ndarray, label_ids: np.ndarray) -> tuple[float, float]:
-    """SSIM of the whole image, and of the lowest category that covers enough of it."""
+def fidelity(
+    image: np.ndarray, full: np.ndarray, label_ids: np.ndarray, names: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """SSIM of the whole image, and of each category; NaN: one that covers too little."""
     quality = ssim_map(image, full)
     means = means_by_label(quality, label_ids)
     least = PROMISED_SHARE * label_ids.size
-    of_category = [mean for label, (mean, n) in means.items() if n >= least and label != UNLABELLED]
-    whole = float(quality.mean())
-    return whole, min(of_category, default=whole)
+    found = [means.get(label, (np.nan, 0)) for label in names.tolist()]
+    return float(quality.mean()), np.array([mean if n >= least else np.nan for mean, n in found])
 
 
 def summary(found: Sequence[Walked], count: int, nbytes: int) -> dict[str, Any]:
@@ -120,13 +146,14 @@ def summary(found: Sequence[Walked], count: int, nbytes: int) -> dict[str, Any]:
                 "first_mb": one.first_bytes() / 1e6,
                 "first_s": [8e-6 * one.first_bytes() / rate for rate in RATES],
                 "finest": float(one.whole.mean(0).max()),
+                "asked": one.kept(),
                 "curve": {
                     "settings": list(one.settings),
                     "count": one.count.mean(0).tolist(),
                     "bytes": one.nbytes[-1].tolist(),
                     "mean": one.whole.mean(0).tolist(),
                     "p5": np.quantile(one.whole, 0.05, axis=0).tolist(),
-                    "lowest": one.lowest.mean(0).tolist(),
+                    "lowest": np.nanmean(np.fmin.reduce(one.by_category, axis=2), axis=0).tolist(),
                 },
             }
             for one in found
@@ -153,4 +180,15 @@ def lines(result: dict[str, Any]) -> list[str]:
     for name, row in methods.items():
         seconds = " | ".join(f"{s:.2f}" for s in row["first_s"])
         out.append(f"| {name} | {row['first_mb']:.3f} | {seconds} | {row['finest']:.4f} |")
+    asked = [(name, one) for name, row in methods.items() for one in row["asked"]]
+    if asked:
+        out += [
+            "",
+            "| asked | method | kept | lowest | whole | splats | first MB | visit MB |",
+            "|---" * 8 + "|",
+        ]
+    for name, one in sorted(asked, key=lambda of: of[1]["target"]):
+        shares = " | ".join(f"{one[key]:.3f}" for key in ("kept", "kept_lowest", "whole"))
+        sizes = " | ".join(f"{one[key] / 1e6:.3f}" for key in ("first_bytes", "bytes"))
+        out.append(f"| {one['target']:g} | {name} | {shares} | {one['count']:,.0f} | {sizes} |")
     return out

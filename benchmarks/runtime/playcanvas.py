@@ -117,6 +117,8 @@ def chosen(
 class StreamedSog:
     """A method of `measure`: the knob is the splat budget."""
 
+    targets: Sequence[float] = ()
+
     def __init__(self, name: str, meta: Path, budgets: Sequence[float], backend: Backend, antialiased: bool):
         self.name, self.settings = name, budgets
         self._backend: Backend = backend

@@ -266,6 +266,8 @@ def _half_reach(power: np.ndarray) -> np.ndarray:
 class SparkTree:
     """A method of `measure`: the knob is the splat budget."""
 
+    targets: Sequence[float] = ()
+
     def __init__(
         self,
         name: str,

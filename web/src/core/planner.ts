@@ -8,6 +8,7 @@ import { climb, nextSegment, type Segment } from "./hull";
 /** The planner's input for a cell, or for a label all of whose cells have one level. */
 export interface Candidate {
   readonly ladder: Ladder;
+  readonly effort: readonly number[]; // by level, bytes, of which those that are there count a part
   readonly highest: number; // highest available level; lower if an increment is damaged
   readonly mean: readonly number[]; // by level, quality; NaN: unknown
   readonly weight: number; // of the label, set by the user
@@ -127,7 +128,7 @@ function choose(
 }
 
 /**
- * The cheapest levels that reach a target; the first level out of sight. For a target of fidelity the picture
+ * The levels that reach a target with the least effort; the first level out of sight. For a target of fidelity the picture
  * as a whole is not to be worse than equal levels of all cells would be for the same bytes.
  */
 function reach(
@@ -141,7 +142,7 @@ function reach(
     const rows = (all[i] ?? []).filter(({ c, level }) => !c.always && level >= 0 && visibleWeight(c) > 0);
     if (!rows.length) return;
     seen.push(...rows);
-    const cost = rows.map(({ c }) => bytesOf(c));
+    const cost = rows.map(({ c }) => effortOf(c));
     const previous = rows.map(({ c }) => before(c));
     const isKnown = !Number.isNaN(needed) && rows.every(({ c }) => c.mean.some((q) => !Number.isNaN(q)));
     const found = bound
@@ -159,7 +160,7 @@ function reach(
   const filled = fill(
     seen.map(({ level }) => level),
     seen.map(({ c }) => c.mean),
-    seen.map(({ c }) => bytesOf(c)),
+    seen.map(({ c }) => effortOf(c)),
     seen.map(({ c }) => visibleWeight(c)),
   );
   seen.forEach((row, i) => {
@@ -246,9 +247,13 @@ function qualityOf({ mean, ladder, highest }: Candidate): readonly number[] {
 
 const before = (c: Candidate): number => (c.previous <= c.highest ? c.previous - 1 : -1);
 
-/** Bytes by available level. */
-const bytesOf = ({ ladder: { bytes }, highest }: Candidate): readonly number[] =>
-  highest < bytes.length ? bytes.slice(0, highest) : bytes;
+/** By available level. */
+const upTo = (highest: number, costs: readonly number[]): readonly number[] =>
+  highest < costs.length ? costs.slice(0, highest) : costs;
+
+const bytesOf = ({ ladder, highest }: Candidate) => upTo(highest, ladder.bytes);
+
+const effortOf = ({ effort, highest }: Candidate) => upTo(highest, effort);
 
 type Costs = Record<Unit, number>;
 

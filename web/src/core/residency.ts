@@ -5,6 +5,9 @@ import { Points, type Sight } from "./distance";
 import type { File } from "./download";
 import { type Candidate, type Ladder, ladderOf } from "./planner";
 
+/** What a byte that need not be fetched counts, in bytes to fetch: it is decoded and drawn all the same. */
+const THERE = 0.25;
+
 /** An increment with its value: pixel-weighted SSIM gain per byte, along the concave hull. */
 export interface Step {
   readonly level: number; // 1-based
@@ -14,6 +17,7 @@ export interface Step {
 /** A cell of the manifest. Drawn are the increments of level `shown`, or `former` until those are decoded. */
 export class Entry {
   readonly ladder: Ladder;
+  private readonly palettePart: number; // bytes of the label's palette that count as the cell's
   readonly replaces: boolean; // whether any level replaces those below
   readonly decoded: (Handle | undefined)[]; // by increment
   /** Of a stream, the increments that were decoded, as they came: those that are disposed of are decoded again. */
@@ -35,7 +39,8 @@ export class Entry {
     public label: Label,
     public cell: Cell,
   ) {
-    this.ladder = ladderOf(cell, Math.ceil((label.palette?.bytes ?? 0) / label.cells.length));
+    this.palettePart = Math.ceil((label.palette?.bytes ?? 0) / label.cells.length);
+    this.ladder = ladderOf(cell, this.palettePart);
     this.points = new Points(cell);
     this.replaces = cell.levels.some(({ refine }) => refine);
     this.decoded = cell.levels.map(() => undefined);
@@ -51,6 +56,22 @@ export class Entry {
   paletteOf(level: number): File | undefined {
     const { palette } = this.label;
     return this.start(level) === this.start(this.cell.levels.length) ? palette : undefined;
+  }
+
+  /**
+   * What each level costs to reach, in bytes: of what is there, a part, since it is drawn but not fetched again.
+   *
+   * @param isHere - whether a file need not be fetched
+   */
+  effort(isHere: (file: File) => boolean): number[] {
+    let there = 0;
+    return this.cell.levels.map((file, k) => {
+      if (file.refine) there = 0;
+      if (this.has(k + 1) || isHere(file)) there += file.bytes;
+      const palette = this.paletteOf(k + 1);
+      const all = there + (palette && isHere(palette) ? this.palettePart : 0);
+      return (this.ladder.bytes[k] ?? 0) - (1 - THERE) * all;
+    });
   }
 
   /** Number of increments below a level that are not part of it, since it or a level below it replaces them. */

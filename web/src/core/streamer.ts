@@ -201,8 +201,9 @@ export class Streamer {
     const begun = this.clock.now();
     const { models } = this;
     models.see(this.families, this.viewpoint);
+    const isHere = (file: File) => this.palettes.has(file.sha256) || this.downloads.isHere(file);
     const groups = this.families.map((family) => {
-      return models.group(family, this.settings, (entry) => this.highest(entry));
+      return models.group(family, this.settings, (entry) => this.highest(entry), isHere);
     });
     const { wanted, around, status } = makePlan(groups, this.settings);
     this.planned = status;

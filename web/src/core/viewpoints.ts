@@ -2,6 +2,7 @@
 
 import type { Label, Promises, Quality, Settings, Viewpoint } from "../types";
 import { Points } from "./distance";
+import type { File } from "./download";
 import { type Candidate, type Group, LEAST_SHARE } from "./planner";
 import {
   boundOf,
@@ -100,7 +101,12 @@ export class ViewpointModels {
   }
 
   /** The planner's input for a label, whose entries' candidates are renewed. */
-  group({ label, entries, outlook }: Family, settings: Settings, highest: (entry: Entry) => number): Group {
+  group(
+    { label, entries, outlook }: Family,
+    settings: Settings,
+    highest: (entry: Entry) => number,
+    isHere: (file: File) => boolean,
+  ): Group {
     const { keeps } = outlook;
     const weight = settings.weights.get(label.id) ?? label.weight;
     const always = settings.always?.get(label.id) ?? label.always;
@@ -109,6 +115,7 @@ export class ViewpointModels {
       const { potential, visible } = sight;
       entry.candidate = {
         ladder,
+        effort: visible && settings.mode === "target" ? entry.effort(isHere) : ladder.bytes,
         highest: highest(entry),
         mean,
         weight,
@@ -136,13 +143,15 @@ function asOne(cells: readonly Candidate[]): Candidate {
   const [first] = cells as readonly [Candidate];
   const longest = cells.reduce((a, b) => (b.mean.length > a.mean.length ? b : a), first);
   const sum = (of: (c: Candidate) => number) => cells.reduce((all, c) => all + of(c), 0);
-  const costs = (unit: keyof Candidate["ladder"]) =>
-    longest.mean.map((_, k) => sum(({ ladder }) => ladder[unit][Math.min(k, ladder[unit].length - 1)] ?? 0));
+  const added = (of: (c: Candidate) => readonly number[]) =>
+    longest.mean.map((_, k) => sum((c) => of(c)[Math.min(k, of(c).length - 1)] ?? 0));
+  const costs = (unit: keyof Candidate["ladder"]) => added(({ ladder }) => ladder[unit]);
   // a damaged increment holds back those cells only that have it
   const limit = Math.max(...cells.map((c) => c.highest));
   return {
     ...first,
     ladder: { bytes: costs("bytes"), gpuBytes: costs("gpuBytes"), count: costs("count") },
+    effort: added(({ effort }) => effort),
     highest: limit,
     mean: longest.mean,
     share: sum(({ share }) => share),

@@ -19,6 +19,7 @@ const odd = labels.map(({ cells: [cell] }) => ({
 const candidates = (changes: Partial<Candidate>[] = []): Candidate[] =>
   odd.map((cell, i) => ({
     ladder: ladderOf(cell),
+    effort: ladderOf(cell).bytes,
     highest: 5,
     mean: [0.4, 0.6, 0.7, 0.8, 0.85],
     weight: 1,
@@ -49,6 +50,7 @@ function cost(wanted: readonly number[], of = candidates()) {
 /** A cell whose levels cost these bytes. */
 const cell = (bytes: number[], mean: number[], more: Partial<Candidate> = {}): Candidate => ({
   ladder: { bytes, gpuBytes: bytes, count: bytes },
+  effort: bytes,
   highest: bytes.length,
   mean,
   weight: 1,
@@ -92,6 +94,13 @@ describe("cells of a label", () => {
     const unknown = cell([10, 20], [Number.NaN, Number.NaN]);
     expect(planOf([{ cells: [near, unknown], needed: 0.5 }]).wanted).toEqual([[3, 2]]);
     expect(planOf([{ cells: [{ ...near, weight: 0 }], needed: 0.8 }]).wanted).toEqual([[1]]);
+  });
+
+  test("that are there come before nearer ones that are not", () => {
+    const there = { ...far, effort: [2.5, 5, 10] };
+    expect(planOf([{ cells: [near, there], needed: 0.56 }]).wanted).toEqual([[1, 2]]);
+    expect(planOf([{ cells: [near, far], needed: 0.56 }]).wanted).toEqual([[2, 1]]);
+    expect(planOf([{ cells: [near, there], needed: 0.7 }]).wanted).toEqual([[2, 2]]);
   });
 
   test("of two that gain as much, the first comes first", () => {

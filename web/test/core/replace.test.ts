@@ -3,6 +3,7 @@
 import { expect, test } from "vitest";
 import { steps } from "../../src/core/order";
 import { ladderOf, makePlan } from "../../src/core/planner";
+import { Entry } from "../../src/core/residency";
 import { Network, seeded, VirtualClock } from "../simulate";
 import { shown, type World, wanted, world } from "../world";
 import { at, bundle, NO_BUDGET, rightOf } from "../worlds";
@@ -26,6 +27,29 @@ test("a level costs what it holds", () => {
   const [a = 0, b = 0, c = 0, d = 0, e = 0] = cell.levels.map(({ bytes }) => bytes);
   expect(ladderOf(cell).bytes).toEqual([a, b, b + c, d, d + e]);
   expect(ladderOf(cell, 7).bytes).toEqual([a, b, b + c, d + 7, d + e + 7]); // its part of a palette
+});
+
+test("what is there costs a quarter of its bytes, a palette's part included", () => {
+  const [label] = bundle(new Network(new VirtualClock()), {
+    ...OPTIONS,
+    labels: 1,
+    streams: true,
+    replaces: [3],
+    palette: 40,
+  }).labels;
+  const [cell] = label?.cells ?? [];
+  if (!label || !cell) throw new Error("no cell");
+  const entry = new Entry(label, cell);
+  const [a = 0, b = 0, c = 0, d = 0, e = 0] = cell.levels.map(({ bytes }) => bytes);
+  expect(entry.effort(() => false)).toEqual(entry.ladder.bytes);
+  expect(entry.effort((file) => file === cell.levels[0] || file === cell.levels[2])).toEqual([
+    0.25 * a,
+    0.25 * a + b,
+    0.25 * c + 40,
+    0.25 * c + d + 40,
+    0.25 * c + d + e + 40,
+  ]);
+  expect(entry.effort(() => true)).toEqual(entry.ladder.bytes.map((bytes) => 0.25 * bytes));
 });
 
 test("above a level that replaces, the first comes first, and those between are never fetched", async () => {
@@ -154,6 +178,7 @@ test("its gain is that over what is shown, for all of its bytes", () => {
   if (!cell) throw new Error("no cell");
   const c = {
     ladder: ladderOf(cell),
+    effort: ladderOf(cell).bytes,
     highest: 5,
     mean: [0.4, 0.5, 0.6, 0.9, 0.95],
     weight: 1,

@@ -316,12 +316,17 @@ describe("models", () => {
     const families = familiesOf(entriesOf(labels));
     const models = new ViewpointModels("ssim", labels, whole);
     models.see(families, at(-6));
-    const settings = { target: 0.8, weights: new Map() } as never;
+    const settings = { mode: "target", target: 0.8, weights: new Map() } as never;
     for (const family of families) {
       const [a, b] = family.entries;
       expect(a?.mean).toEqual(b?.mean);
       expect(a?.mean.every((mean) => mean > 0)).toBe(true);
-      const { cells, bound } = models.group(family, settings, ({ cell }) => cell.levels.length);
+      const { cells, bound } = models.group(
+        family,
+        settings,
+        ({ cell }) => cell.levels.length,
+        () => false,
+      );
       expect(cells).toHaveLength(1);
       expect(cells[0]?.ladder.bytes[4]).toBe((a?.ladder.bytes[4] ?? 0) + (b?.ladder.bytes[4] ?? 0));
       expect(bound).toHaveLength(5);
