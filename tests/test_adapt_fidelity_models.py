@@ -162,6 +162,17 @@ def test_the_full_model_keeps_everything_and_promises_rise():
     assert (model.status, model.quality, model.num_views) == ("calibrated", "fidelity", 80)
 
 
+def test_a_category_without_a_model_takes_no_promise_from_the_others():
+    models, _ = made(0)
+    cameras = viewpoints(20, 4)
+    whole, some = (expect(m, CELLS, cameras, K) for m in (models, {7: models[7]}))
+    levels = np.random.default_rng(0).integers(1, K + 1, (20, 4))
+    assert (some.share[:, some.column == 0] > 0).any()
+    found = some.of_composition(levels)
+    assert np.isnan(found[:, 0]).all()
+    np.testing.assert_allclose(found[:, 1], whole.of_composition(levels)[:, 1], rtol=1e-12)
+
+
 def test_a_promise_is_the_largest_target_whose_needs_are_met():
     models, _ = made(0)
     expected = expect(models, CELLS, viewpoints(20, 4), K)

@@ -126,9 +126,11 @@ class Expected:
     def of_composition(self, levels: Int[np.ndarray, "V C"]) -> Float[np.ndarray, "V L"]:
         """Expected fidelity of each category in compositions (levels from 1); NaN out of sight."""
         at = np.take_along_axis(self.mean, levels[..., None] - 1, 2)[..., 0]
-        member, seen = self.member, self.share > 0
-        value, weight = np.where(seen, self.share * at, 0) @ member, self.share @ member
-        return np.where(weight > 0, value / np.where(weight > 0, weight, 1), np.nan)
+        seen = self.share > 0
+        unknown = seen & np.isnan(at)  # in a product with `member`, NaN would reach other categories too
+        value, weight = np.where(seen & ~unknown, self.share * at, 0) @ self.member, self.category_shares()
+        known = (weight > 0) & ~(unknown @ self.member)
+        return np.where(known, value / np.where(known, weight, 1), np.nan)
 
 
 def expect(
