@@ -24,6 +24,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_index
+from sagesplat.formats.label_edits import FILE, Hide, LabelEdits, Split, dump_edits, ladder_hash
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.metrics.image import ssim_map
@@ -37,8 +38,9 @@ from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.api import open_run
 from sagesplat.stages.bundle import bundle
 from sagesplat.stages.export import export_scene
+from sagesplat.stages.label_edits import apply_labels
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.results import promises_of, sampled_of, viewpoints_of
+from sagesplat.stages.results import increments_of, promises_of, sampled_of, viewpoints_of
 
 SMALL = AdoptConfig(fit="none", views=14, size=(48, 36), shares=(0.2, 0.4, 0.7, 1.0), kind="object")
 REST = RunConfig(
@@ -145,6 +147,34 @@ def test_it_bundles(adopted: Path, tmp_path: Path) -> None:
 def test_a_second_call_does_nothing(adopted: Path) -> None:
     _, events = _adopt(adopted.parent, adopted.parent / "ball.ply", SMALL)
     assert not [event for event in events if isinstance(event, StageDone)]
+
+
+def test_what_is_clicked_becomes_a_category_with_levels_and_promises(adopted: Path, viewer: Path) -> None:
+    """Splits name Gaussians of the last level; those that came in follow, and levels are made anew."""
+    job = Job(RunDir(adopted), lambda event: None, "cpu")
+    clicked = np.flatnonzero(job.ladder.load(4).of_labels([3]).means[:, 1] > 0).tolist()
+    operations = (Split("car", "roof", {"car": tuple((row, 1) for row in clicked)}), Hide("roof", True))
+    edits = LabelEdits(ladder_hash(increments_of(job), job.names()), operations)
+    (adopted / FILE).write_bytes(dump_edits(edits))
+    made = apply_labels(job, viewer=viewer)
+    new = Job(RunDir(made.path), lambda event: None, "cpu")
+    roof = next(label for label, name in new.names().items() if name == "roof")
+    before, after = (
+        {tuple(at): label for at, label in zip(g.means.tolist(), g.label_ids.tolist(), strict=True)}
+        for g in (job.came_in, new.came_in)
+        if g is not None
+    )
+    moved = [at for at, label in after.items() if label != before[at]]
+    assert len(moved) == len(clicked) == new.ladder.counts[roof, 4]
+    assert {(before[at], after[at]) for at in moved} == {(3, roof)}
+    assert min(height for _, height, _ in moved) > -0.02  # steps of streams
+    assert roof in open_run(made.path).fidelity
+    assert new.parents == {"car 1": "car"}
+    for one, other in zip(job.scene.views, new.scene.views, strict=True):
+        np.testing.assert_allclose(one.camera.w2c, other.camera.w2c, atol=1e-6)
+    manifest = json.loads((made.bundle.path / "manifest.json").read_text())
+    assert [label["name"] for label in manifest["labels"] if label.get("hidden")] == ["roof"]
+    apply_labels(job, viewer=viewer)  # replaces the earlier one, from what is there already
 
 
 def test_levels_are_a_file_of_streams_for_each_category(adopted: Path) -> None:
