@@ -1,6 +1,7 @@
 """A splat that somebody else trained becomes a run: `sagesplat adopt`."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from sagesplat.core.events import Event, StageDone, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_index
 from sagesplat.formats.label_edits import FILE, Hide, LabelEdits, Split, dump_edits, ladder_hash
+from sagesplat.formats.labels import sidecar, write_labels
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.metrics.image import ssim_map
@@ -32,6 +34,9 @@ from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.segment.registry import SEGMENTERS
+from sagesplat.segment.segmenters import Segmented
 from sagesplat.stages import pipeline
 from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
@@ -269,6 +274,55 @@ def test_instances_come_in_and_go_out_with_their_category(tmp_path: Path, name: 
     assert out.gaussians.counts() == {62: 100, 201: 100, 202: 200}
     export_scene(job, tmp_path / name.replace("ball", "chairs"), level=4, labels=["chair 2"], target=None)
     assert len(read_splat(tmp_path / name.replace("ball", "chairs")).gaussians) == 200
+
+
+def test_labels_beside_the_file_that_changed_are_read_again(tmp_path: Path) -> None:
+    """They are a part of the splat as it is read, like an offset beside it."""
+    g = _ball()
+    write_ply(tmp_path / "ball.ply", g, {3: "car", 184: "tree-merged"})
+    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+    words = tmp_path / "ball.ply", SMALL, SceneConfig(), MasksConfig(), LabelsConfig()
+    open_splat(job, *words)
+    write_labels(tmp_path / "ball.ply", torch.full_like(g.label_ids, 1), {1: "person"})
+    with pytest.raises(RunError, match=r"ball\.ply\.labels\.json"):
+        open_splat(replace(job), *words)
+    again = replace(job, force=True)
+    open_splat(again, *words)
+    assert again.names()[1] == "person"
+    assert set(again.load_last_level().counts()) == {1}
+    sidecar(tmp_path / "ball.ply").unlink()
+    with pytest.raises(RunError, match=r"ball\.ply\.labels\.json"):
+        open_splat(replace(job), *words)
+
+
+class _Halves:
+    """A network that sees a car on the left of every picture, and trees on the right."""
+
+    taxonomy = Taxonomy({3: "car", 184: "tree-merged"})
+
+    def __call__(self, photos: Sequence[np.ndarray], /) -> list[Segmented]:
+        found = []
+        for photo in photos:
+            ids = np.full(photo.shape[:2], 184, np.int16)
+            ids[:, : photo.shape[1] // 2] = 3
+            found.append(Segmented(ids))
+        return found
+
+
+@pytest.mark.parametrize("kind", ["hf", "onnx", "text"])
+def test_networks_segment_the_renders_and_their_label_images_vote(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Any
+) -> None:
+    """A splat alone: no photos, no labels; its renders are segmented."""
+    factory = replace(SEGMENTERS[kind], load=lambda *_: _Halves(), settings=lambda config: {})
+    monkeypatch.setitem(SEGMENTERS, kind, factory)
+    write_ply(tmp_path / "ball.ply", _ball(labels=False))
+    masks = MasksConfig(segmenter=kind, prompts="car" if kind == "text" else None)
+    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+    open_splat(job, tmp_path / "ball.ply", SMALL, SceneConfig(), masks, LabelsConfig())
+    assert job.load_last_level().counts().keys() >= {3, 184}
+    view = job.scene.views[job.scene.train_ids[0]]
+    assert view.image_path.is_relative_to(tmp_path / "run" / "capture")
 
 
 def test_merged_categories_take_their_instances_along(tmp_path: Path) -> None:
