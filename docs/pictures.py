@@ -9,14 +9,16 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from sagesplat import Camera, FinishedRun, Gaussians, label_image, open_run, rasterize
+from sagesplat.stages.looks import looks
 
 IMAGES = Path(__file__).parent / "images"
 LARGER = 1.5  # than the photos
+SCREEN = 2.0  # the largest that promises are for, times the photos' pixels
 LEVELS = (1, 4, 8, 12)
 
 
 def main() -> None:
-    """Write concept-categories.webp and concept-levels.webp."""
+    """Write concept-categories.webp, concept-levels.webp and fidelities.webp."""
     run = open_run(sys.argv[1])
     view = run.scene.views[2]
     camera = enlarged(view.camera)
@@ -37,6 +39,14 @@ def main() -> None:
         cells.append(cell)
     grid(cells, 2, "concept-levels.webp")
 
+    crops = []
+    for look in looks(run.job, SCREEN):
+        crop = Image.fromarray(look.image)
+        what = "full model" if look.asked == 1 else f"asked {look.asked:g}: {look.fidelity:.3f}"
+        caption(crop, f"{what}, {look.nbytes / 1000:,.0f} kB", 13)
+        crops.append(crop)
+    grid(crops, len(crops), "fidelities.webp")
+
 
 def enlarged(camera: Camera) -> Camera:
     """The same view with more pixels."""
@@ -55,12 +65,13 @@ def render(
     return Image.fromarray((image.clamp(0, 1).numpy() * 255).round().astype(np.uint8))
 
 
-def caption(image: Image.Image, text: str) -> None:
-    """Write a line into the lower left corner."""
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default(22)
-    box = draw.textbbox((10, image.height - 36), text, font)
+def caption(image: Image.Image, text: str, height: int = 22) -> None:
+    """Write a line of some pixels' height into the lower left corner."""
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(height)
+    at = (height // 2, image.height - round(1.65 * height))
+    box = draw.textbbox(at, text, font)
     draw.rectangle((box[0] - 6, box[1] - 4, box[2] + 6, box[3] + 4), fill=(20, 24, 30))
-    draw.text((10, image.height - 36), text, (255, 255, 255), font)
+    draw.text(at, text, (255, 255, 255), font)
 
 
 def grid(cells: list[Image.Image], columns: int, name: str) -> None:

@@ -25,7 +25,7 @@ from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands, next_steps
 from sagesplat.output.place_figures import Place
 from sagesplat.output.report import write_report
-from sagesplat.output.report_data import PromiseFacts, ReportData
+from sagesplat.output.report_data import Look, PromiseFacts, ReportData
 
 NAMES = {3: "vase", 7: "dining table", 9: "$x^2$ <b>&amp; _odd"}
 COLOURS = {3: (250, 250, 10), 7: (0, 160, 180), 9: (90, 10, 200), -1: (128, 128, 128)}
@@ -267,7 +267,10 @@ def whole_page() -> ReportData:
         drawn=drawn,
         planned={label: values[:, 1] for label, values in drawn.items()},
         drawn_at=Place(place.points, place.colours, place.at[:10], place.towards[:10]),
-        looks=[(0.9, np.full((8, 12, 3), 90, np.uint8)), (1.0, np.full((8, 12, 3), 99, np.uint8))],
+        looks=[
+            Look(0.9, 120_000, 0.934, 0.871, np.full((8, 12, 3), 90, np.uint8)),
+            Look(1.0, 350_000, 1.0, 1.0, np.full((8, 12, 3), 99, np.uint8)),
+        ],
         promise=PromiseFacts(0.95, 57, 27, 83, "screens of 0.5 to 2 times the photos' focal length"),
         settings=[("train.max_steps", "1000")],
         provenance=[("sha256 of scene.json", "f" * 64)],
@@ -277,6 +280,12 @@ def whole_page() -> ReportData:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     return write_report(tmp_path_factory.mktemp("whole"), whole_page())
+
+
+def test_what_was_asked_is_pictured_with_its_bytes_and_what_it_measures(whole):
+    page = whole.read_text()
+    assert "0.9 asked</b><br>0.12 MB<br>measured 0.934, here 0.871" in page
+    assert "full model</b><br>0.35 MB</figcaption>" in page
 
 
 def test_the_next_step_is_what_was_measured():

@@ -1,6 +1,7 @@
 """A splat that somebody else trained becomes a run: `sagesplat adopt`."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_index
+from sagesplat.formats.label_edits import FILE, Hide, LabelEdits, Split, dump_edits, ladder_hash
+from sagesplat.formats.labels import sidecar, write_labels
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.metrics.image import ssim_map
@@ -31,14 +34,18 @@ from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
+from sagesplat.segment.masks import Taxonomy
+from sagesplat.segment.registry import SEGMENTERS
+from sagesplat.segment.segmenters import Segmented
 from sagesplat.stages import pipeline
 from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.api import open_run
 from sagesplat.stages.bundle import bundle
 from sagesplat.stages.export import export_scene
+from sagesplat.stages.label_edits import apply_labels
 from sagesplat.stages.methods import method_of
-from sagesplat.stages.results import promises_of, sampled_of, viewpoints_of
+from sagesplat.stages.results import increments_of, promises_of, sampled_of, viewpoints_of
 
 SMALL = AdoptConfig(fit="none", views=14, size=(48, 36), shares=(0.2, 0.4, 0.7, 1.0), kind="object")
 REST = RunConfig(
@@ -147,6 +154,34 @@ def test_a_second_call_does_nothing(adopted: Path) -> None:
     assert not [event for event in events if isinstance(event, StageDone)]
 
 
+def test_what_is_clicked_becomes_a_category_with_levels_and_promises(adopted: Path, viewer: Path) -> None:
+    """Splits name Gaussians of the last level; those that came in follow, and levels are made anew."""
+    job = Job(RunDir(adopted), lambda event: None, "cpu")
+    clicked = np.flatnonzero(job.ladder.load(4).of_labels([3]).means[:, 1] > 0).tolist()
+    operations = (Split("car", "roof", {"car": tuple((row, 1) for row in clicked)}), Hide("roof", True))
+    edits = LabelEdits(ladder_hash(increments_of(job), job.names()), operations)
+    (adopted / FILE).write_bytes(dump_edits(edits))
+    made = apply_labels(job, viewer=viewer)
+    new = Job(RunDir(made.path), lambda event: None, "cpu")
+    roof = next(label for label, name in new.names().items() if name == "roof")
+    before, after = (
+        {tuple(at): label for at, label in zip(g.means.tolist(), g.label_ids.tolist(), strict=True)}
+        for g in (job.came_in, new.came_in)
+        if g is not None
+    )
+    moved = [at for at, label in after.items() if label != before[at]]
+    assert len(moved) == len(clicked) == new.ladder.counts[roof, 4]
+    assert {(before[at], after[at]) for at in moved} == {(3, roof)}
+    assert min(height for _, height, _ in moved) > -0.02  # steps of streams
+    assert roof in open_run(made.path).fidelity
+    assert new.parents == {"car 1": "car"}
+    for one, other in zip(job.scene.views, new.scene.views, strict=True):
+        np.testing.assert_allclose(one.camera.w2c, other.camera.w2c, atol=1e-6)
+    manifest = json.loads((made.bundle.path / "manifest.json").read_text())
+    assert [label["name"] for label in manifest["labels"] if label.get("hidden")] == ["roof"]
+    apply_labels(job, viewer=viewer)  # replaces the earlier one, from what is there already
+
+
 def test_levels_are_a_file_of_streams_for_each_category(adopted: Path) -> None:
     listed = read_index(RunDir(adopted).increments)
     assert {one.format for one in listed} == {"stream"}
@@ -239,6 +274,55 @@ def test_instances_come_in_and_go_out_with_their_category(tmp_path: Path, name: 
     assert out.gaussians.counts() == {62: 100, 201: 100, 202: 200}
     export_scene(job, tmp_path / name.replace("ball", "chairs"), level=4, labels=["chair 2"], target=None)
     assert len(read_splat(tmp_path / name.replace("ball", "chairs")).gaussians) == 200
+
+
+def test_labels_beside_the_file_that_changed_are_read_again(tmp_path: Path) -> None:
+    """They are a part of the splat as it is read, like an offset beside it."""
+    g = _ball()
+    write_ply(tmp_path / "ball.ply", g, {3: "car", 184: "tree-merged"})
+    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+    words = tmp_path / "ball.ply", SMALL, SceneConfig(), MasksConfig(), LabelsConfig()
+    open_splat(job, *words)
+    write_labels(tmp_path / "ball.ply", torch.full_like(g.label_ids, 1), {1: "person"})
+    with pytest.raises(RunError, match=r"ball\.ply\.labels\.json"):
+        open_splat(replace(job), *words)
+    again = replace(job, force=True)
+    open_splat(again, *words)
+    assert again.names()[1] == "person"
+    assert set(again.load_last_level().counts()) == {1}
+    sidecar(tmp_path / "ball.ply").unlink()
+    with pytest.raises(RunError, match=r"ball\.ply\.labels\.json"):
+        open_splat(replace(job), *words)
+
+
+class _Halves:
+    """A network that sees a car on the left of every picture, and trees on the right."""
+
+    taxonomy = Taxonomy({3: "car", 184: "tree-merged"})
+
+    def __call__(self, photos: Sequence[np.ndarray], /) -> list[Segmented]:
+        found = []
+        for photo in photos:
+            ids = np.full(photo.shape[:2], 184, np.int16)
+            ids[:, : photo.shape[1] // 2] = 3
+            found.append(Segmented(ids))
+        return found
+
+
+@pytest.mark.parametrize("kind", ["hf", "onnx", "text"])
+def test_networks_segment_the_renders_and_their_label_images_vote(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Any
+) -> None:
+    """A splat alone: no photos, no labels; its renders are segmented."""
+    factory = replace(SEGMENTERS[kind], load=lambda *_: _Halves(), settings=lambda config: {})
+    monkeypatch.setitem(SEGMENTERS, kind, factory)
+    write_ply(tmp_path / "ball.ply", _ball(labels=False))
+    masks = MasksConfig(segmenter=kind, prompts="car" if kind == "text" else None)
+    job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
+    open_splat(job, tmp_path / "ball.ply", SMALL, SceneConfig(), masks, LabelsConfig())
+    assert job.load_last_level().counts().keys() >= {3, 184}
+    view = job.scene.views[job.scene.train_ids[0]]
+    assert view.image_path.is_relative_to(tmp_path / "run" / "capture")
 
 
 def test_merged_categories_take_their_instances_along(tmp_path: Path) -> None:

@@ -32,12 +32,15 @@ NAMES = {1: "chair 1", 2: "grass-merged", 3: "chair 2"}
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three walls as streams: two instances of chair, and between them grass, whose left half is white."""
-    folder = tmp_path_factory.mktemp("edit")
+    return _written(tmp_path_factory.mktemp("edit"))
+
+
+def _written(folder: Path, **streams: Any) -> Path:
     contents = three_walls(folder)
     g = cloud()
     white = ((g.label_ids == 2) & (g.means[:, 0] < 0))[:, None, None]
     g = replace(g, sh0=g.sh0.masked_fill(white, 1.7))
-    made = write_streams(folder / "streams", g, SIZES, NAMES, label_of={i: i for i in SIZES})
+    made = write_streams(folder / "streams", g, SIZES, NAMES, label_of={i: i for i in SIZES}, **streams)
     contents = replace(
         contents,
         categories=[
@@ -119,6 +122,36 @@ def test_a_region_is_split_off_by_its_ranks(editing: Opened, bundle: Path) -> No
     is_white = (grass.sh0[:, 0].min(1).values > 1).numpy()
     assert not (chosen & is_white).any()
     assert chosen.sum() > 0.8 * (~is_white).sum()  # all but those that lie apart
+
+
+@browser_test
+def test_where_levels_replace_those_below_ranks_are_of_the_last_one(tmp_path: Path, browser: Any) -> None:
+    """Merged splats are in no category of their own: the full model is loaded while the editor is open."""
+    bundle = _written(tmp_path, replaces=dict.fromkeys(SIZES, (3,)))
+    with serve(bundle) as url, open_page(url, (900, 640), browser=browser) as opened:
+        ready(opened, 1)
+        page = opened.page
+        page.evaluate("sagesplat.set({mode: 'base'})")
+        page.keyboard.press("l")
+        opened.wait_for("!document.querySelector('.picked').textContent.startsWith('Loading')")
+        page.mouse.click(490, 330)
+        page.locator(".scopes button", has_text="Alike").click()
+        opened.wait_for("document.querySelector('.picked').textContent.startsWith('part of')")
+        page.get_by_label("Name", exact=True).fill("right half")
+        page.get_by_label("Make the selection a category").click()
+        with page.expect_download() as waiting:
+            page.locator(".editor button", has_text="Save").click()
+        edits = parse_edits(Path(waiting.value.path()).read_bytes())
+        assert opened.complaints == []
+    (split,) = edits.operations
+    assert isinstance(split, Split)
+    grass = read_streams(tmp_path / "streams", _listed(bundle))[0].of_labels([2])
+    last = grass.sh0[SIZES[2][1] :, 0]  # the third level replaces the second
+    is_white = (last.min(1).values > 1).numpy()
+    chosen = np.zeros(len(is_white), bool)
+    chosen[ranks_of(split.gaussians["grass-merged"])] = True
+    assert not (chosen & is_white).any()
+    assert chosen.sum() > 0.8 * (~is_white).sum()
 
 
 def _listed(bundle: Path) -> list[Any]:

@@ -65,7 +65,7 @@ def write_report(folder: Path, data: ReportData) -> Path:
         qr=qr_address(data.url) if data.url else "",
         sheets=sheets,
         viewpoints=None if data.viewpoints is None else _picture(data.viewpoints, "JPEG"),
-        looks=[(fidelity, _picture(image, "PNG")) for fidelity, image in data.looks],
+        looks=[(look, look.nbytes / MB, _picture(look.image, "PNG")) for look in data.looks],
         panels=[_pictures(panel, data.colours, data.photos) for panel in data.panels],
         chips={name_of(i, data.names): _css(data.colours.get(i, (128, 128, 128))) for i in labels},
     )

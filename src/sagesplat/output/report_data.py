@@ -31,6 +31,17 @@ class PromiseFacts:
 
 
 @dataclass(frozen=True, eq=False)
+class Look:
+    """A part of a view at the plan for a fidelity, or of the full model."""
+
+    asked: float  # 1: the full model
+    nbytes: int  # to send, of the whole scene
+    fidelity: float  # that the whole view measures
+    fidelity_of_part: float
+    image: UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True, eq=False)
 class ReportData:
     """Everything the page shows, wherever it comes from. Views are rows of `view_names`."""
 
@@ -71,7 +82,7 @@ class ReportData:
     planned: Mapping[int, Float32[np.ndarray, " V"]] = field(default_factory=dict)
     """The same of the levels of the plan that the page leads with; those of cells are added up."""
     drawn_at: Place | None = None  # those viewpoints from above
-    looks: Sequence[tuple[float, UInt8[np.ndarray, "h w 3"]]] = ()  # fidelity, part of a picture
+    looks: Sequence[Look] = ()  # ascending, the full model last
 
 
 def main_plan(data: ReportData) -> Plan:

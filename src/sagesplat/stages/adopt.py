@@ -19,7 +19,9 @@ from sagesplat.core.events import Progress, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.names import repaired
 from sagesplat.core.sh import sh0_to_rgb
+from sagesplat.formats.labels import sidecar
 from sagesplat.formats.levels import read_header, read_level, read_more, write_level, write_set
+from sagesplat.formats.offsets import beside as offset_beside
 from sagesplat.formats.splat import relative_to
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.io.typed import check_limits
@@ -163,7 +165,8 @@ def _make_capture(
     outputs = [run.adopted, run.contact_sheet]
     outputs += [] if photos else [own / "sparse"]
     outputs += [own / "masks" / "labels.json"] if labelled else []
-    run_stage(job, "adopt", settings, [source], outputs, make)
+    beside = [path for path in (sidecar(source), offset_beside(source)) if path.is_file()]
+    run_stage(job, "adopt", settings, [source, *beside], outputs, make)
     return photos
 
 

@@ -2,7 +2,8 @@
 
 Renaming and settings move nothing. Merged categories are measured by what was measured of their parts
 (`adapt.regroup`); where one is split, its parts are measured. Then the models are fitted and calibrated, in
-compositions of the new levels, for the categories that changed, and the plan and the bundle made.
+compositions of the new levels, for the categories that changed, and the plan and the bundle made. Merged
+Gaussians stand for others of one category, so those of an adopted splat are made anew where it is edited.
 """
 
 import shutil
@@ -11,10 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
+from scipy.spatial import KDTree
+
 from sagesplat.adapt.regroup import NewCell
-from sagesplat.core.config import FitConfig, PlanConfig
+from sagesplat.core.config import AdoptConfig, FitConfig, PlanConfig, RunConfig, SceneConfig
 from sagesplat.core.errors import LabelError, RunError
 from sagesplat.core.events import StageDone, StageStarted
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.label_edits import FILE, LabelEdits, dump_edits, ladder_hash, read_edits
 from sagesplat.io.files import atomic_folder, loads_json
 from sagesplat.run.job import Job
@@ -22,10 +27,13 @@ from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.records import read_record, record
 from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.display_names import categories
+from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.parents import write_parents
 from sagesplat.segment.relabel import Relabelled, relabelled
+from sagesplat.stages import pipeline
 from sagesplat.stages.bundle import BundleMade, bundle
 from sagesplat.stages.edited import LabelSettings, label_settings, write_edited
+from sagesplat.stages.given import write_given_cameras, write_given_splat
 from sagesplat.stages.plan import make_plan
 from sagesplat.stages.refit import refit
 from sagesplat.stages.regroup import measure, move_labels, move_levels
@@ -60,8 +68,9 @@ def apply_labels(
 ) -> LabelsApplied:
     """Make a new run of a finished one, with edited categories, and its bundle: `sagesplat.apply_labels`.
 
-    The run stays as it is. RunError also for a run with levels that replace those below, where the edits
-    merge or split. `viewer`: the built one; None: the package's own.
+    The run stays as it is. Where edits merge or split categories of an adopted splat whose levels replace
+    those below, its levels are made and measured anew, which resumes where it was killed. `viewer`: the built
+    one; None: the package's own.
     """
     path = edits or job.run.path / FILE
     out = (out or job.run.path.resolve().with_name(f"{job.run.path.resolve().name}-edited")).resolve()
@@ -71,6 +80,8 @@ def apply_labels(
     found = read_edits(path)
     made = _checked(job, found, path)
     _check_out(job.run, out)
+    if made.changed and job.by_cell.replaces:
+        return _adopt_again(job, out, found, made, viewer)
     begin = time.perf_counter()
     job.emit(StageStarted("labels"))
     with atomic_folder(out) as fresh:
@@ -92,10 +103,8 @@ def _checked(job: Job, edits: LabelEdits, path: Path) -> Relabelled:
         )
     if not edits.operations:
         raise LabelError(f"{path}: no operations; there is nothing to apply")
-    ladder, label_of = job.by_cell, job.cells.label_of
-    counts = dict.fromkeys(sorted(label_of.values()), 0)
-    for cell, sizes in ladder.sizes.items():
-        counts[label_of[cell]] += sizes[-1]
+    last = job.ladder.levels[-1]  # of which edits name Gaussians
+    counts = {label: count for (label, level), count in job.ladder.counts.items() if level == last}
     try:
         made = relabelled(
             {label: names[label] for label in counts}, counts, edits.operations,
@@ -109,10 +118,10 @@ def _checked(job: Job, edits: LabelEdits, path: Path) -> Relabelled:
             f"{path}: the name {taken[0]!r} is that of a category that label images show, without Gaussians; "
             "choose another"
         )
-    if made.changed and (ladder.replaces or any(one.format != "stream" for one in increments)):
+    if made.changed and not job.by_cell.replaces and any(one.format != "stream" for one in increments):
         raise RunError(
-            f"{job.run.path}: levels that replace those below, or SPZ files; its categories can be renamed, "
-            "hidden, weighed and kept in full, but not merged or split"
+            f"{job.run.path}: levels in PLY or SPZ files; its categories can be renamed, hidden, weighed and "
+            "kept in full, but not merged or split"
         )
     return made
 
@@ -120,13 +129,69 @@ def _checked(job: Job, edits: LabelEdits, path: Path) -> Relabelled:
 def _check_out(run: RunDir, out: Path) -> None:
     if out == run.path.resolve():
         raise RunError(f"{out}: the run itself; name another folder for the edited run")
-    if out.is_dir() and any(out.iterdir()) and not RunDir(out).edited.exists():
+    ours = (RunDir(out).edited, RunDir(out).from_python / FILE)
+    if out.is_dir() and any(out.iterdir()) and not any(path.exists() for path in ours):
         raise RunError(f"{out}: neither empty nor an edited run; name a new folder")
+
+
+def _adopt_again(
+    job: Job, out: Path, edits: LabelEdits, made: Relabelled, viewer: Path | None
+) -> LabelsApplied:
+    """Adopt the splat that came in once more, with its new labels and from the same viewpoints."""
+    new = replace(_job_on(job, out), force=True)
+    known, run = recorded_settings(job.run), new.run
+    config: AdoptConfig = replace(known["adopt"], lod=0)  # a PLY has only one
+    run.edited.unlink(missing_ok=True)  # it is no finished edited run any more
+    run.from_python.mkdir(parents=True, exist_ok=True)
+    (run.from_python / FILE).write_bytes(dump_edits(edits))  # says whose folder it is
+    parents = made.parents(job.parents, job.names())
+    source = write_given_splat(
+        run, _with_new_labels(job, made), made.names, job.antialiased, offset=job.scene.offset,
+        parents={label: parents[name] for label, name in made.names.items() if name in parents},
+    )  # fmt: skip
+    if not config.cameras:
+        cameras = [view.camera for view in job.scene.views]
+        config = replace(config, cameras=write_given_cameras(run, cameras, job.scene.offset))
+    plan: PlanConfig = known.get("plan", PlanConfig())
+    plan = replace(plan, weights=made.weights if plan.budget else {})
+    later = {name: known[name] for name in ("sample", "fit") if name in known}
+    scene = known.get("scene_config", SceneConfig())
+    pipeline.adopt(new, source, config, RunConfig(scene, plan=plan, **later))
+    _write_settings(job, new, edits, made)
+    return LabelsApplied(out, bundle(new, out / "bundle", viewer=viewer), True, tuple(made.names.values()))
+
+
+def _with_new_labels(job: Job, made: Relabelled) -> Gaussians:
+    """The splat that came in, each Gaussian with the new category of the nearest one of its last level.
+
+    That level has the same Gaussians, rounded, in another order, without those that are hardly to be seen.
+    """
+    before, top = job.came_in, job.ladder.load(job.ladder.levels[-1])
+    assert before is not None  # adopted levels alone replace those below
+    ids = torch.full_like(before.label_ids, UNLABELLED)
+    for old, new_ids in made.new_ids.items():
+        rows = before.label_ids == old
+        nearest = KDTree(top.means[top.label_ids == old].numpy()).query(before.means[rows].numpy())[1]
+        ids[rows] = torch.from_numpy(new_ids[nearest])
+    return replace(before, label_ids=ids)
+
+
+def _job_on(job: Job, path: Path) -> Job:
+    return Job(
+        replace(job.run, path=path), job.emit, job.backend, job.threads, device=job.device,
+        memory_limit=job.memory_limit, executor=job.executor,
+    )  # fmt: skip
+
+
+def _write_settings(job: Job, new: Job, edits: LabelEdits, made: Relabelled) -> None:
+    settings = LabelSettings(made.weights, made.hidden, made.always)
+    write_edited(new.run, job.run.path.name, loads_json(dump_edits(edits)), settings)
 
 
 def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
     """Copy what stays to the new folder; the job on it."""
-    new = replace(job.run, path=fresh)
+    started = _job_on(job, fresh)
+    new = started.run
     for names, source, target in ((_KEPT, job.run.path, fresh), (_OF_LADDER, job.run.adapted, new.adapted)):
         target.mkdir(exist_ok=True)
         for name in names:
@@ -140,12 +205,8 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
     if job.run.has_instances:
         _keep_instances_alone(job.run, new)
     write_parents(new.parents, made.parents(job.parents, job.names()))
-    settings = LabelSettings(made.weights, made.hidden, made.always)
-    write_edited(new, job.run.path.name, loads_json(dump_edits(edits)), settings)
-    return Job(
-        new, job.emit, job.backend, job.threads, device=job.device, memory_limit=job.memory_limit,
-        executor=job.executor, source=job,
-    )  # fmt: skip
+    _write_settings(job, started, edits, made)
+    return replace(started, source=job)
 
 
 def _keep_instances_alone(run: RunDir, new: RunDir) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from sagesplat import __version__
 from sagesplat.adapt.fidelity import pooled_cells
@@ -23,7 +22,6 @@ from sagesplat.adapt.viewpoints import SETS, in_words
 from sagesplat.core.config import LadderKind
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.pictures import open_picture
-from sagesplat.metrics.image import ssim_map
 from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands
 from sagesplat.output.place_figures import Place
@@ -37,6 +35,7 @@ from sagesplat.scene import describe
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.display_names import titles
 from sagesplat.segment.masks import UNLABELLED
+from sagesplat.stages.looks import looks
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import scene_plan
 from sagesplat.stages.results import (
@@ -52,8 +51,6 @@ from sagesplat.stages.results import (
 from sagesplat.stages.shared import label_colors
 from sagesplat.viewer.frames import FLIP, upward
 
-_LOOKS = (0.8, 0.9, 0.95, 0.98)
-_PART = 3  # of the sides of a view
 PANELS = 3  # views shown in pictures
 
 
@@ -111,7 +108,7 @@ def report_data(
         drawn=drawn,
         planned=planned,
         drawn_at=_place(job, [sets.cameras[row] for row in sets.rows("fit")]) if sets else None,
-        looks=_looks(job) if sets else (),
+        looks=looks(job) if sets else (),
     )
 
 
@@ -224,32 +221,6 @@ def _promise(
         if label in drawn
     }
     return facts, drawn, planned
-
-
-def _looks(job: Job) -> list[tuple[float, np.ndarray]]:
-    """What fidelities look like: the part of a view with most detail, at the levels that measure nearest to
-    `_LOOKS` in that part, ascending; last the full model's.
-    """
-    scene, ladder = job.scene, job.ladder
-    camera = scene.views[int((*scene.test_ids, *scene.train_ids)[0])].camera.neutral
-    images = [
-        render_rgb(ladder.load(level), camera, backend=job.backend, antialiased=job.antialiased)
-        for level in ladder.levels
-    ]
-    size = [max(1, side // _PART) for side in images[-1].shape[:2]]
-    grey = images[-1].mean(2)
-    detail = uniform_filter(grey**2, size) - uniform_filter(grey, size) ** 2
-    inside = tuple(
-        slice(side // 2, full - side + side // 2 + 1) for side, full in zip(size, grey.shape, strict=True)
-    )
-    corner = np.unravel_index(int(detail[inside].argmax()), detail[inside].shape)
-    part = tuple(slice(int(at), int(at) + side) for at, side in zip(corner, size, strict=True))
-    measured = [float(ssim_map(image, images[-1])[part].mean()) for image in images[:-1]]
-    rows = sorted({int(np.abs(np.array(measured) - one).argmin()) for one in _LOOKS}) if measured else []
-    found = [(value, images[row]) for row, value in zip(rows, np.take(measured, rows).tolist(), strict=True)]
-    return [
-        (value, np.round(255 * image[part]).astype(np.uint8)) for value, image in (*found, (1.0, images[-1]))
-    ]
 
 
 def picture_panels(job: Job, composed: Gaussians) -> list[Panel]:

@@ -8,6 +8,7 @@ export interface Packed {
   readonly first?: number; // rank in the label of the first one
   readonly words: Uint32Array;
   readonly count: number;
+  readonly level?: number; // that the first one came with
   readonly hidden?: Uint8Array; // splats that are not shown
 }
 

@@ -145,7 +145,8 @@ export class EditorCard {
   private pick(x: number, y: number): void {
     this.error = "";
     this.editor.pick(x, y);
-    if (!this.editor.selection && !this.editor.isWaiting) this.error = "Nothing is there";
+    const { selection, isWaiting, isLoading } = this.editor;
+    if (!selection && !isWaiting && !isLoading) this.error = "Nothing is there";
     this.update();
   }
 
@@ -261,6 +262,7 @@ export class EditorCard {
   private sentence(): string {
     const { editor } = this;
     if (editor.isWaiting) return "Loading the rest of this category…";
+    if (editor.isLoading) return "Loading the full model, which edits are of…";
     const names = editor.selectedCategories.map(({ title }) => title);
     if (!editor.selection) return HINT;
     const part = editor.selection.scope === "alike" ? "part of " : "";
@@ -272,15 +274,15 @@ export class EditorCard {
     const { rename, split, merge, hide, full, save } = this.actions;
     const chosen = editor.selectedCategories;
     const [one] = chosen;
-    const { fixed, selection } = editor;
+    const { selection } = editor;
     const part = selection?.scope === "alike";
     const set = (element: HTMLButtonElement | HTMLSelectElement, usable: boolean) => {
       element.disabled = !usable;
     };
-    set(rename, chosen.length === 1 && !part && !fixed);
-    set(split, part && !fixed);
-    set(merge, chosen.length > 0 && !part && !fixed);
-    set(this.into, chosen.length > 0 && !part && !fixed);
+    set(rename, chosen.length === 1 && !part);
+    set(split, part);
+    set(merge, chosen.length > 0 && !part);
+    set(this.into, chosen.length > 0 && !part);
     for (const element of [hide, full, this.weight]) set(element, chosen.length > 0 && !part);
     set(save, editor.edits.canUndo);
     setText(hide, chosen.length && chosen.every((c) => c.hidden) ? "Show" : "Hide");

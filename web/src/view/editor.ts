@@ -46,6 +46,7 @@ export class Editor {
   isWaiting = false; // for the rest of a label, of which a region is to be selected
   pickMs = Number.NaN; // of the last pick
   private seed: Seed | null = null;
+  private wasLoading = false;
   private width = DEFAULT_TOLERANCE; // index of TOLERANCES
   private readonly listeners = new Set<() => void>();
   private readonly weighed = new Set<number>(); // labels whose weight edits have set
@@ -61,6 +62,7 @@ export class Editor {
     });
     viewer.streamer.onChange(() => {
       if (this.isWaiting && this.seed) this.choose(this.seed, "alike");
+      else if (this.wasLoading !== this.isLoading) this.notify();
     });
   }
 
@@ -148,10 +150,11 @@ export class Editor {
     return this.selection ? (this.edits.categories.list[this.selection.category] ?? null) : null;
   }
 
-  /** Why categories of this scene cannot be renamed, merged or split; null: they can. */
-  get fixed(): string | null {
-    const labels = [...this.labels.values()];
-    return labels.some(replaces) ? "Not where levels replace those below." : null;
+  /** Whether merged splats are drawn still in place of those that edits are of. */
+  get isLoading(): boolean {
+    const labels = [...this.labels.values()].filter(replaces);
+    const wanted = labels.filter(({ id }) => this.isOpen && !this.viewer.isHidden(id));
+    return wanted.some(({ cells }) => !cells.every((cell) => this.cloudOf(cell)));
   }
 
   /** Applies operations, and selects what they leave; throws where one cannot be. */
@@ -200,12 +203,18 @@ export class Editor {
     const ray = this.viewer.stage.ray(x, y);
     const clouds = [...this.labels.values()].flatMap((label) =>
       placed(label).flatMap(({ cell, first }) => {
-        const cloud = layer.splatsOf(cell.id);
+        const cloud = this.cloudOf(cell);
         return cloud ? { ...cloud, first } : [];
       }),
     );
     const some = this.labels.get(clouds[0]?.label ?? 0)?.cells[0];
     return pick(clouds, layer.encodingOf(some?.id ?? 0), ray);
+  }
+
+  /** The shown splats of a cell; null where they are merged ones, which have no ranks. */
+  private cloudOf(cell: Cell): Packed | null {
+    const cloud = this.viewer.stage.layer.splatsOf(cell.id);
+    return cloud && (cloud.level ?? 1) > startOf(cell) ? cloud : null;
   }
 
   private categoryAt({ label, rank }: Picked): number {
@@ -214,9 +223,7 @@ export class Editor {
 
   private scopes(found: Picked): Scope[] {
     const hasParent = this.family(this.categoryAt(found)).length > 1;
-    const label = this.labels.get(found.label);
-    const alike: Scope[] = label && replaces(label) ? [] : ["alike"];
-    return [...(hasParent ? (["instance"] as const) : []), "category", ...alike];
+    return [...(hasParent ? (["instance"] as const) : []), "category", "alike"];
   }
 
   /** The categories of one parent: all instances of "chair", and what is "chair" without being one of them. */
@@ -250,7 +257,7 @@ export class Editor {
     const { layer } = this.viewer.stage;
     const owner = this.edits.categories.owner.get(seed.label);
     const cells = this.labels.get(seed.label)?.cells ?? [];
-    const count = cells.reduce((sum, cell) => sum + (layer.splatsOf(cell.id)?.count ?? 0), 0);
+    const count = cells.reduce((sum, cell) => sum + (this.cloudOf(cell)?.count ?? 0), 0);
     if (!owner || count < owner.length) return null;
     const among = Uint8Array.from(owner, (number) => +(number === category));
     const tolerance = TOLERANCES[this.width] ?? 0.3;
@@ -296,7 +303,9 @@ export class Editor {
       if (this.touches(this.weighed, id, weight !== label.weight)) weights.set(id, weight);
       if (this.touches(this.hid, id, hidden !== (label.hidden ?? false))) this.hide(id, hidden);
       const waits = this.isWaiting && this.seed?.label === id;
-      const full = waits || own.some((one) => one.always);
+      // edits are of the last level, which merged splats below it are not part of
+      const last = replaces(label) && (this.isOpen || own.length > 1);
+      const full = waits || last || own.some((one) => one.always);
       if (full !== label.always) always.set(id, full);
       const marks = this.marksOf(id, numbers);
       for (const { cell, first } of placed(label)) {
@@ -329,6 +338,7 @@ export class Editor {
   }
 
   private notify(): void {
+    this.wasLoading = this.isLoading;
     for (const callback of this.listeners) callback();
   }
 }
@@ -344,11 +354,14 @@ const originOf = (label: Label): Origin => ({
   hidden: label.hidden ?? false,
 });
 
-/** Splats of a cell's increments. */
-const countOf = ({ levels }: Cell): number => levels.reduce((sum, { count }) => sum + count, 0);
+/** Number of a cell's increments that its last level does not have, since it or one below it replaces them. */
+const startOf = ({ levels }: Cell): number => levels.map(({ refine }) => !!refine).lastIndexOf(true);
 
-const replaces = ({ cells }: Label): boolean =>
-  cells.some(({ levels }) => levels.some(({ refine }) => refine));
+/** Splats of a cell's last level. */
+const countOf = (cell: Cell): number =>
+  cell.levels.slice(Math.max(0, startOf(cell))).reduce((sum, { count }) => sum + count, 0);
+
+const replaces = ({ cells }: Label): boolean => cells.some((cell) => startOf(cell) > 0);
 
 /** The cells of a label, each with the rank of its first splat: a label's ranks go through its cells in turn. */
 function placed({ cells }: Label): { cell: Cell; first: number }[] {

@@ -191,11 +191,12 @@ export class SparkLayer implements Renderer {
     const column = this.#columns.get(cell);
     const words = column?.source.splats.packedArray;
     if (!column || !words || this.#hidden.has(column.label)) return null;
-    const { marks, source, label } = column;
+    const { marks, source, label, shown } = column;
     return {
       label,
       words,
       count: source.count,
+      ...(shown[0] && { level: shown[0].level }),
       ...(marks && { hidden: marks.map((m) => +(m === Mark.hidden)) }),
     };
   }
