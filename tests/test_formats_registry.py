@@ -36,11 +36,13 @@ def test_categories_and_flags_are_kept(tmp_path, suffix, antialiased):
 
 
 def test_other_names_are_refused(tmp_path):
-    known = r"\.ply, \.spz, \.sog, \.glb, \.compressed\.ply, \.splat"
+    known = r"\.ply, \.spz, \.sog, \.glb, \.compressed\.ply, \.splat, \.ssog"
     with pytest.raises(DataError, match=rf"a\.ksplat: .* use {known} or lod-meta\.json"):
         write_splat(tmp_path / "a.ksplat", random_gaussians(3))
     with pytest.raises(DataError, match=r"several levels; name a \.ply, .* or \.splat"):
         write_splat(tmp_path / "lod-meta.json", random_gaussians(3))
+    with pytest.raises(DataError, match=r"a\.ssog: holds several levels; name a \.ply"):
+        write_splat(tmp_path / "a.ssog", random_gaussians(3))
     for name in ("a.html", "a.HTM"):  # what people try for a page
         with pytest.raises(
             DataError, match=rf"{name}: a page .* `sagesplat bundle RUN .* --single-file` writes"

@@ -32,6 +32,7 @@ WRITERS: dict[str, SplatWriter] = {
     ".glb": gltf_write.WRITER,
     ".compressed.ply": compressed_ply.WRITER,
     ".splat": dotsplat.WRITER,
+    ".ssog": lod_meta_write.SSOG_WRITER,
     lod_meta.LOD_META: lod_meta_write.WRITER,
 }
 """By the suffix of files, the longest that fits, or their whole name."""

@@ -162,8 +162,8 @@ def write_splat(
         offset: What is to be added to all positions for those of the capture, written beside the file.
 
     Raises:
-        DataError: For another suffix, lod-meta.json, which holds several levels, and what the format cannot
-            hold.
+        DataError: For another suffix, lod-meta.json and .ssog, which hold several levels, and what the format
+            cannot hold.
         OSError: If a file cannot be written.
 
     Example:
