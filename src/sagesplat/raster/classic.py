@@ -1,11 +1,12 @@
-"""Models for viewers that draw otherwise: without antialiasing (gsplat's mode `classic`), as PlayCanvas does."""
+"""Models for viewers that draw otherwise: without antialiasing (gsplat's `classic`), or as PlayCanvas."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.raster import add_weights
@@ -29,12 +30,8 @@ def for_classic(g: Gaussians, cameras: Iterable[Camera]) -> Gaussians:
     """
     g = g.detach().to("cpu")
     weighted, weights = torch.zeros(2, len(g), dtype=torch.float64)
-    for camera in cameras:
-        weight = np.zeros((len(g), 1), np.float32)
-        everywhere = np.zeros((camera.height, camera.width), np.int64)
-        add_weights(g, camera, everywhere, weight, antialiased=True)
-        rows = torch.from_numpy(np.flatnonzero(weight[:, 0] > _LEAST))
-        seen, weight = g.select(rows), torch.from_numpy(weight[:, 0])[rows]
+    for camera, rows, weight in _seen(g, cameras, antialiased=True):
+        seen = g.select(rows)
         *_, opacities = projected(seen, camera, world_to_camera(camera, None), antialiased=True)
         factors = opacities / seen.logit_opacities.double().sigmoid()
         weighted[rows] += weight * factors.log()
@@ -46,24 +43,34 @@ def for_classic(g: Gaussians, cameras: Iterable[Camera]) -> Gaussians:
 
 
 def for_playcanvas(g: Gaussians, cameras: Iterable[Camera]) -> Gaussians:
-    """Gaussians that are drawn without antialiasing, changed for PlayCanvas's engine; the result is on the CPU.
+    """Gaussians that are drawn without antialiasing, to be drawn by PlayCanvas's engine; they are on the CPU.
 
-    Its low-pass has a quarter of the usual variance (0.3 of half a pixel squared, playcanvas 2.23), and its
-    kernel is lowered so that it ends in 0 at sqrt(8) standard deviations. So the variance that is missing, at
-    the distance in pixels of `cameras` (the geometric mean over those that have the Gaussian in sight), goes
-    into the Gaussians, and their sizes are multiplied by what keeps the kernel's integral.
+    Its low-pass has a quarter of the usual variance (0.3 half pixels squared, in playcanvas 2.23), and its
+    kernel is lowered so that it ends in 0 at sqrt(8) standard deviations. So the variance that is missing
+    goes into the Gaussians, by the pixels of `cameras` (the mean of pixels per unit, squared, weighted by
+    blending weight; none where no camera sees a Gaussian), and their sizes are multiplied by what keeps the
+    kernel's integral.
     """
     g = g.detach().to("cpu")
-    logs, seen = torch.zeros(2, len(g))
+    weighted, weights = torch.zeros(2, len(g), dtype=torch.float64)
+    for camera, rows, weight in _seen(g, cameras, antialiased=False):
+        forward = torch.from_numpy(camera.direction).double()
+        depth = g.means[rows].double() @ forward + float(camera.w2c[2, 3])
+        weighted[rows] += weight * (camera.focal / depth.clamp_min(_LEAST)) ** 2
+        weights[rows] += weight
+    per_unit = weighted / weights.clamp_min(_LEAST)  # squared pixels
+    missing = torch.where(weights > 0, (BLUR - _PLAYCANVAS_BLUR / _WIDER**2) / per_unit, 0)
+    variances = (2 * g.log_scales.double()).exp() + missing[:, None]
+    return replace(g, log_scales=((variances.log() / 2) + math.log(_WIDER)).float())
+
+
+def _seen(
+    g: Gaussians, cameras: Iterable[Camera], *, antialiased: bool
+) -> Iterator[tuple[Camera, Tensor, Tensor]]:
+    """Each camera, the rows that it sees, and their blending weights there."""
     for camera in cameras:
-        rotation, shift, K = map(torch.from_numpy, (camera.w2c[:3, :3], camera.w2c[:3, 3], camera.K))
-        u, v, depth = ((g.means @ rotation.T + shift) @ K.T).unbind(1)  # the pixel, times the depth
-        inside = (
-            (depth > 0) & (u >= 0) & (u <= camera.width * depth) & (v >= 0) & (v <= camera.height * depth)
-        )
-        logs += torch.where(inside, (depth / camera.focal).log(), 0)
-        seen += inside
-    pixel = (logs / seen.clamp_min(1)).exp()  # world units that a pixel covers
-    missing = torch.where(seen > 0, (BLUR - _PLAYCANVAS_BLUR / _WIDER**2) * pixel**2, 0)
-    variances = (2 * g.log_scales).exp() + missing[:, None]
-    return replace(g, log_scales=(variances * _WIDER**2).log() / 2)
+        weight = np.zeros((len(g), 1), np.float32)
+        everywhere = np.zeros((camera.height, camera.width), np.int64)
+        add_weights(g, camera, everywhere, weight, antialiased=antialiased)
+        rows = np.flatnonzero(weight[:, 0] > _LEAST)
+        yield camera, torch.from_numpy(rows), torch.from_numpy(weight[rows, 0])

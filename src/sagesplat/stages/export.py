@@ -104,10 +104,11 @@ def export_scene(
     `labels` (none: all) and `without` name categories or instances; a category means its instances too. What
     is left out leaves holes, which an event names.
 
-    `rasterize_mode`: how the file will be drawn; None: levels of detail as PlayCanvas's engine does, scenes as
-    the run was trained where the format says so, else `classic`. `lod-meta.json` and `.ssog` get `levels`, or all there are, as levels of detail.
-    `labels_inside`: a PLY has the labels as a property, not beside it. `doubles`: positions of a PLY are
-    doubles in the capture's own coordinates. Returns the number of Gaussians.
+    `rasterize_mode`: how the file will be drawn; None: levels of detail as by PlayCanvas's engine, scenes as
+    the run was trained where the format says so, else `classic`. `lod-meta.json` and `.ssog` get `levels`,
+    or all there are, as levels of detail. `labels_inside`: a PLY has the labels as a property, not beside it.
+    `doubles`: positions of a PLY are doubles in the capture's own coordinates. Returns the number of
+    Gaussians.
     """
     writer = writer_of(path)
     for given, name in ((labels_inside, "labels-inside"), (doubles, "doubles")):
