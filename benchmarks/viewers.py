@@ -1,8 +1,8 @@
 """Exports in the engines of others: PlayCanvas and Spark in Chromium, against our renders of the same levels.
 
-A page draws one file from one camera, with the engine's own settings but for these: Spark is told whether a
-file antialiases, since it reads no flag; PlayCanvas is told which level of a streamed SOG to show. Files for
-PlayCanvas are written with `--rasterize-mode playcanvas`, others as `sagesplat export` writes them.
+A page draws one file from one camera, with the engine's own settings but for these: Spark, which antialiases,
+is told where the run was trained without; PlayCanvas is told which level of a streamed SOG to show. Files for
+PlayCanvas are written with `--rasterize-mode playcanvas`, those for Spark as the run was trained.
 """
 
 import base64
@@ -29,7 +29,7 @@ from PIL import Image
 from benchmarks.common import finish
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.lod_meta import LOD_META
-from sagesplat.formats.splats import num_lods, read_splat
+from sagesplat.formats.splats import num_lods
 from sagesplat.metrics.image import psnr
 from sagesplat.raster import rasterize
 from sagesplat.run.job import Job
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 Engine = Literal["playcanvas", "spark"]
 FORMATS: dict[Engine, tuple[str, ...]] = {
-    "playcanvas": (".ply", ".compressed.ply", ".sog", ".glb"),
-    "spark": (".ply", ".compressed.ply", ".spz", ".sog", ".splat"),
+    "playcanvas": (".ply", ".compressed.ply", ".sog", ".glb", LOD_META),
+    "spark": (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".rad"),
 }
 PACKAGES = {"playcanvas": "playcanvas", "spark": "@sparkjsdev/spark", "three": "three"}  # in node_modules
 # to the axes that engines show a format in; those of a PLY are shown as they are
@@ -138,21 +138,19 @@ def measure(
         for lod, level in enumerate(levels):
             g = job.ladder.load(level)
             wanted = [ours(g, camera, job.antialiased) for camera in cameras]
-            for engine in engines:
-                for kind in (*FORMATS[engine], *((LOD_META,) if engine == "playcanvas" else ())):
-                    file = streamed if kind == LOD_META else folder / f"{engine}-{level}{kind}"
-                    if kind != LOD_META:
-                        mode = "playcanvas" if engine == "playcanvas" else None
-                        export_scene(job, file, level=level, labels=[], target=None, rasterize_mode=mode)
-                    antialiased = read_splat(file, lod if kind == LOD_META else 0).antialiased
-                    found = [
-                        drawn.draw(engine, file, camera, antialiased=antialiased, lod=lod)
-                        for camera in cameras
-                    ]
-                    error = float(
-                        np.mean([np.square(a - b).mean() for a, b in zip(found, wanted, strict=True)])
-                    )
-                    yield {"engine": engine, "format": kind, "level": level, "dB": float(psnr(error))}
+            for engine, kind in [(one, kind) for one in engines for kind in FORMATS[one]]:
+                if kind == ".splat" and bool(g.shN.any()):
+                    continue  # it holds no harmonics
+                file = streamed if kind == LOD_META else folder / f"{engine}-{level}{kind}"
+                antialiased = engine == "spark" and job.antialiased
+                if kind != LOD_META:
+                    mode = "playcanvas" if engine == "playcanvas" else "antialiased" if antialiased else None
+                    export_scene(job, file, level=level, labels=[], target=None, rasterize_mode=mode)
+                found = [
+                    drawn.draw(engine, file, camera, antialiased=antialiased, lod=lod) for camera in cameras
+                ]
+                error = np.mean([np.square(a - b).mean() for a, b in zip(found, wanted, strict=True)])
+                yield {"engine": engine, "format": kind, "level": level, "dB": float(psnr(float(error)))}
 
 
 def main(

@@ -36,10 +36,10 @@ def test_categories_and_flags_are_kept(tmp_path, suffix, antialiased):
 
 
 def test_other_names_are_refused(tmp_path):
-    known = r"\.ply, \.spz, \.sog, \.glb, \.compressed\.ply, \.splat, \.ssog"
+    known = r"\.ply, \.spz, \.sog, \.glb, \.compressed\.ply, \.splat, \.rad, \.ssog"
     with pytest.raises(DataError, match=rf"a\.ksplat: .* use {known} or lod-meta\.json"):
         write_splat(tmp_path / "a.ksplat", random_gaussians(3))
-    with pytest.raises(DataError, match=r"several levels; name a \.ply, .* or \.splat"):
+    with pytest.raises(DataError, match=r"several levels; name a \.ply, .* or \.rad"):
         write_splat(tmp_path / "lod-meta.json", random_gaussians(3))
     with pytest.raises(DataError, match=r"a\.ssog: holds several levels; name a \.ply"):
         write_splat(tmp_path / "a.ssog", random_gaussians(3))

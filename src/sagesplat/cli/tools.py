@@ -34,9 +34,9 @@ def export(
 ) -> None:
     """Write Gaussians for other viewers: the planned scene, one level, all levels, or their increments.
 
-    The name of OUT chooses the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat; FOLDER/lod-meta.json
-    and .ssog hold all levels. Categories are kept: in a file beside (OUT.labels.json), or inside an .spz, an
-    .ssog and a .glb.
+    The name of OUT chooses the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .rad;
+    FOLDER/lod-meta.json and .ssog hold all levels. Categories are kept: in a file beside (OUT.labels.json),
+    or inside an .spz, an .ssog and a .glb.
 
     Args:
         run: run folder

@@ -153,7 +153,7 @@ def write_splat(
     """Write Gaussians in the format that the suffix of a path says, with their labels; `read_splat` reads it.
 
     Args:
-        path: A .ply, .compressed.ply, .spz, .sog, .glb or .splat; replaced if it is there.
+        path: A .ply, .compressed.ply, .spz, .sog, .glb, .splat or .rad; replaced if it is there.
         gaussians: N Gaussians on any device.
         names: Category names by label id. With the labels they go into the file where its format has a place
             for them, else into one beside it, PATH.labels.json.
