@@ -1,8 +1,8 @@
 """Exports in the engines of others: PlayCanvas and Spark in Chromium, against our renders of the same levels.
 
-A page draws one file from one camera, with the engine's own settings but for these: Spark, which antialiases,
-is told where the run was trained without; PlayCanvas is told which level of a streamed SOG to show. Files for
-PlayCanvas are written with `--rasterize-mode playcanvas`, those for Spark as the run was trained.
+A page draws one file from one camera, with the engine's own settings but for these: Spark sorts by depth, as
+3DGS does, and is told where a run was trained without antialiasing, which it does by itself; PlayCanvas is told
+which level of a streamed SOG to show. Files for PlayCanvas are written with `--rasterize-mode playcanvas`, those for Spark as the run was trained.
 """
 
 import base64
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 Engine = Literal["playcanvas", "spark"]
 FORMATS: dict[Engine, tuple[str, ...]] = {
     "playcanvas": (".ply", ".compressed.ply", ".sog", ".glb", LOD_META),
-    "spark": (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".rad"),
+    "spark": (".ply", ".spz", ".sog", ".splat", ".rad"),
 }
 PACKAGES = {"playcanvas": "playcanvas", "spark": "@sparkjsdev/spark", "three": "three"}  # in node_modules
 # to the axes that engines show a format in; those of a PLY are shown as they are

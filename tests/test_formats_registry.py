@@ -82,6 +82,7 @@ def test_the_name_says_the_format(tmp_path, name, kind):
     assert ((turns[0] * turns[1]).sum(1).abs() > 0.9995).all()
     if kind == "compressed PLY":
         torch.testing.assert_close(back.shN, g.shN.clamp(-4, 4), atol=1 / 32 + 1e-6, rtol=0)
+        assert (back.shN - g.shN.clamp(-4, 4)).mean(0).abs().max() < 2e-4  # rounding turns no colour
 
 
 # The file that docs/architecture.md, "How to add a file format", asks for.

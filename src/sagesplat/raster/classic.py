@@ -16,8 +16,7 @@ from sagesplat.scene.scene import Camera
 
 _LEAST = 1e-6  # blending weight, in pixels, below which a Gaussian counts as unseen
 _PLAYCANVAS_BLUR = 0.3 / 4  # px^2
-_END = math.exp(-4)  # of the kernel, which PlayCanvas's engine subtracts
-_WIDER = math.sqrt((1 - _END) / (1 - 5 * _END))
+_WIDER = 1.05  # 1.04 keeps the integral of a kernel; what is fainter than 1/255 is left out, too
 
 
 def for_classic(g: Gaussians, cameras: Iterable[Camera]) -> Gaussians:
@@ -48,8 +47,7 @@ def for_playcanvas(g: Gaussians, cameras: Iterable[Camera]) -> Gaussians:
     Its low-pass has a quarter of the usual variance (0.3 half pixels squared, in playcanvas 2.23), and its
     kernel is lowered so that it ends in 0 at sqrt(8) standard deviations. So the variance that is missing
     goes into the Gaussians, by the pixels of `cameras` (the mean of pixels per unit, squared, weighted by
-    blending weight; none where no camera sees a Gaussian), and their sizes are multiplied by what keeps the
-    kernel's integral.
+    blending weight; none where no camera sees a Gaussian), and they become wider by a twentieth.
     """
     g = g.detach().to("cpu")
     weighted, weights = torch.zeros(2, len(g), dtype=torch.float64)
