@@ -1,8 +1,9 @@
 """Exports in the engines of others: PlayCanvas and Spark in Chromium, against our renders of the same levels.
 
 A page draws one file from one camera, with the engine's own settings but for these: Spark sorts by depth, as
-3DGS does, and is told where a run was trained without antialiasing, which it does by itself; PlayCanvas is told
-which level of a streamed SOG to show. Files for PlayCanvas are written with `--rasterize-mode playcanvas`, those for Spark as the run was trained.
+3DGS does, and is told where a run was trained without antialiasing, which it does by itself; PlayCanvas is
+told which level of a streamed SOG to show. PlayCanvas gets files of `--rasterize-mode playcanvas`. Those for
+Spark are as the run was trained.
 """
 
 import base64
