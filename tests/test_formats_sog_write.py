@@ -1,6 +1,7 @@
 """What sagesplat writes as SOG and streamed SOG is read back within the formats' steps, with its labels."""
 
 import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial import KDTree
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.labels import sidecar
-from sagesplat.formats.lod_meta_write import write_lod_meta
+from sagesplat.formats.lod_meta_write import write_lod_meta, write_ssog
 from sagesplat.formats.sog_write import sog_order, write_sog
 from sagesplat.formats.splats import num_lods, read_splat
 from tests.conftest import random_gaussians
@@ -114,6 +115,8 @@ def test_levels_of_detail_have_cells_as_their_tree(tmp_path):
     assert size == sum(path.stat().st_size for path in (tmp_path / "a").rglob("*.*"))
     assert num_lods(tmp_path / "a") == 3
     document = json.loads((tmp_path / "a" / "lod-meta.json").read_text())
+    head = ["version", "asset", "count", "counts", "lodLevels", "filenames", "tree"]
+    assert list(document) == head  # as splat-transform 3.8 has it: no null for an environment, no errors
     assert document["counts"] == [900, 225, 2]
     assert document["filenames"] == [f"{name}/meta.json" for name in ("0_0", "0_1", "1_0", "2_0")]
     categories = document["tree"]["children"]
@@ -161,3 +164,26 @@ def test_the_bound_of_a_cell_holds_the_boxes_of_its_gaussians(tmp_path):
     bound = json.loads((tmp_path / "b" / "lod-meta.json").read_text())["tree"]["bound"]
     assert bound["min"] == pytest.approx([-5, -4, 1.5], abs=1e-5)
     assert bound["max"] == pytest.approx([7, 8, 4.5], abs=1e-5)
+
+
+def test_a_streamed_sog_in_one_file_is_the_folder_stored(tmp_path):
+    fine = replace(random_gaussians(300, degree=1), label_ids=(torch.arange(300) % 3).to(torch.int16))
+    levels, label_of, names = [fine, fine.select(torch.arange(0, 300, 5))], {0: 5, 1: 2, 2: 5}, {5: "tree"}
+    size = write_ssog(tmp_path / "a.ssog", levels, label_of, names, parents={5: "plant"}, antialiased=True)
+    assert size == (tmp_path / "a.ssog").stat().st_size
+    write_ssog(tmp_path / "b.ssog", levels, label_of, names, parents={5: "plant"}, antialiased=True)
+    assert (tmp_path / "a.ssog").read_bytes() == (tmp_path / "b.ssog").read_bytes()
+    write_lod_meta(tmp_path / "c", levels, label_of, names, parents={5: "plant"}, antialiased=True)
+    with zipfile.ZipFile(tmp_path / "a.ssog") as archive:
+        assert {info.compress_type for info in archive.infolist()} == {zipfile.ZIP_STORED}
+        inside = {info.filename: archive.read(info) for info in archive.infolist()}
+    files = [path for path in (tmp_path / "c").rglob("*") if path.is_file()]
+    assert inside == {path.relative_to(tmp_path / "c").as_posix(): path.read_bytes() for path in files}
+    for lod in range(num_lods(tmp_path / "a.ssog")):
+        one, other = (read_splat(tmp_path / name, lod) for name in ("a.ssog", "c"))
+        assert torch.equal(one.gaussians.means, other.gaussians.means)
+        assert torch.equal(one.gaussians.label_ids, other.gaussians.label_ids)
+        assert (one.names, one.parents, one.antialiased) == ({5: "tree"}, {5: "plant"}, True)
+    with pytest.raises(DataError, match=r"d\.ssog: a level without Gaussians"):
+        write_ssog(tmp_path / "d.ssog", [fine.select(torch.arange(0))], label_of)
+    assert not (tmp_path / "d.ssog").exists()

@@ -384,6 +384,20 @@ def test_extensions_of_version_3(tmp_path):
     )
 
 
+def test_version_3_keeps_labels_that_change_with_each_row(tmp_path):
+    """Readers that know no records, such as Spark, see the same attributes before them."""
+    g = replace(random_gaussians(6000, degree=0), label_ids=(torch.arange(6000) % 2 * 12345).to(torch.int16))
+    write_spz(tmp_path / "a.spz", g, names={0: "tree", 12345: "sky"}, parents={0: "plant"})
+    splat = read_spz_splat(tmp_path / "a.spz")
+    assert torch.equal(splat.gaussians.label_ids, g.label_ids)
+    assert (splat.kind, splat.names, splat.parents) == ("SPZ 3", {0: "tree", 12345: "sky"}, {0: "plant"})
+    bare, kept = (
+        zlib.decompress(content, 31) for content in (encode_spz(g), (tmp_path / "a.spz").read_bytes())
+    )
+    assert kept[16 : len(bare)] == bare[16:]
+    assert (bare[14], kept[14]) == (0, 2)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_version_4_holds_what_version_3_does(degree):
     g = random_gaussians(200, degree=degree, seed=5)

@@ -1,5 +1,6 @@
-"""Antialiased models for rasterisers that do not antialias."""
+"""Models for rasterisers that draw in another way."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 from conftest import pinhole, random_gaussians
 
 from sagesplat.raster import rasterize
-from sagesplat.raster.classic import for_classic
+from sagesplat.raster.classic import for_classic, for_playcanvas
 
 
 def test_one_camera_sees_the_same_picture() -> None:
@@ -40,3 +41,25 @@ def test_what_no_camera_sees_stays_and_all_is_finite(logit: float) -> None:
     assert torch.equal(found.logit_opacities[10:], g.logit_opacities[10:])
     assert torch.isfinite(found.logit_opacities).all()
     assert torch.equal(for_classic(g, []).logit_opacities, g.logit_opacities)
+
+
+def test_the_low_pass_that_playcanvas_lacks_is_in_the_gaussians() -> None:
+    """At twice the size, of which every second pixel is taken, ours is a quarter of its own, as theirs is."""
+    camera = pinhole()
+    g = random_gaussians(60, degree=1)
+    g = replace(g, log_scales=g.log_scales - 1.5)
+    twice = camera.resized(2 * camera.width, 2 * camera.height)
+    twice.K[:2, 2] += 0.5  # so that every second pixel has the centre of one
+
+    def theirs(g):
+        return rasterize(g, twice).rgb[1::2, 1::2]
+
+    found = for_playcanvas(g, [camera])
+    found = replace(found, log_scales=found.log_scales - math.log(1.05))
+    wanted = rasterize(g, camera).rgb
+    error, before = ((theirs(some) - wanted).square().mean() for some in (found, g))
+    assert error < before / 10
+    unseen = for_playcanvas(g, [])
+    torch.testing.assert_close(unseen.log_scales, g.log_scales + math.log(1.05))
+    assert torch.equal(found.means, g.means)
+    assert torch.equal(found.logit_opacities, g.logit_opacities)

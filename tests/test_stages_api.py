@@ -48,11 +48,17 @@ def test_a_composed_scene_is_for_viewers_that_do_not_antialias(runs, tmp_path):
         assert sidecar(tmp_path / name).exists() != (name in ("a.glb", "inside.ply"))
     with pytest.raises(RunError, match=r"--labels-inside is for \.ply"):
         export_scene(run.job, tmp_path / "b.spz", level=1, labels=(), target=None, labels_inside=True)
+    sizes = {}
     export_increments(run.job, tmp_path / "chunks", "ply")
     assert not any(read_splat(path).antialiased for path in (tmp_path / "chunks").glob("*.ply"))
-    levels = tmp_path / "lod-meta.json"
-    with pytest.raises(RunError, match=r"lod-meta.json: says how it is drawn; leave out --rasterize-mode$"):
-        export_scene(run.job, levels, level=None, labels=(), target=None, rasterize_mode="classic")
+    for mode in (None, "classic", "antialiased"):  # None: for PlayCanvas's engine, which does not antialias
+        levels = tmp_path / f"{mode}.ssog"
+        export_scene(run.job, levels, level=None, labels=(), target=None, levels=[1], rasterize_mode=mode)
+        splat = read_splat(levels)
+        assert splat.antialiased is (mode == "antialiased")
+        sizes[mode] = float(splat.gaussians.log_scales.mean())
+    assert sizes[None] > sizes["classic"] + 0.04
+    assert sizes["classic"] == pytest.approx(sizes["antialiased"], abs=0.01)  # but opacities differ
 
 
 @pytest.mark.parametrize("ladder", ["nested", "snapshots"])

@@ -481,6 +481,7 @@ def test_export_writes_what_other_viewers_read(finished: Path, tmp_path: Path) -
         splat = read_splat(tmp_path / name)
         assert splat.gaussians.counts() == expected.counts()
         assert splat.names.items() <= job.names().items()
+    assert export_scene(job, tmp_path / "a.rad", **options) == len(expected)
     with pytest.raises(RunError, match=r"a\.sog: exists; add --force"):
         export_scene(job, tmp_path / "a.sog", **options)
     with pytest.raises(DataError, match=r"a\.ksplat: its name says no format"):
@@ -505,6 +506,14 @@ def test_export_writes_levels_of_detail(finished: Path, tmp_path: Path) -> None:
     again = replace(job, force=True)
     export_scene(again, path, **options, levels=[2, 4])
     assert num_lods(path) == 2
+    ssog = path.with_name("a.ssog")
+    export_scene(job, ssog, **options, levels=[2, 4])
+    assert [len(read_splat(ssog, lod).gaussians) for lod in (0, 1)] == [
+        len(read_splat(path, lod).gaussians) for lod in (0, 1)
+    ]
+    with pytest.raises(RunError, match=r"a\.ssog: exists; add --force"):
+        export_scene(job, ssog, **options)
+    ssog.unlink()
     (path.parent / "letter.txt").write_text("dear")
     with pytest.raises(RunError, match="lods: not empty"):
         export_scene(again, path, **options)

@@ -42,7 +42,7 @@ EXCEPTIONS: dict[str, str] = {
     "demo.capture:cached_capture": OURS,
     "download.scenes:read_registry": OURS,
     "formats.increments:as_increment": _WROTE,
-    "formats.sog_write:write_sog": _WROTE,
+    "formats.sog_write:archived": _WROTE,
     "formats.stream:encode_stream": _WROTE,
     "formats.levels:select_level": "columns of a level that read_level has read",
     "formats.offsets:write_doubles": _WROTE,

@@ -228,7 +228,7 @@ def clean(
 
     Args:
         run: run folder; or a splat, of which OUT gets what stays
-        out: .ply, .compressed.ply, .spz, .sog, .glb or .splat to write; only with a splat
+        out: .ply, .compressed.ply, .spz, .sog, .glb, .splat or .rad to write; only with a splat
         cameras: of a splat: where its photos were taken from, as a capture (best with its photos), a
             cameras.json of 3DGS, a transforms.json or a viewpoints.json (default: viewpoints drawn from the
             splat, which tell less)

@@ -26,7 +26,7 @@ def export(
     target_ssim: SomeShare | None = None,
     chunks: Literal["spz", "ply"] | None = None,
     levels: tuple[StepNumber, ...] = (),
-    rasterize_mode: Literal["classic", "antialiased"] | None = None,
+    rasterize_mode: Literal["classic", "antialiased", "playcanvas"] | None = None,
     labels_inside: bool = False,
     doubles: bool = False,
     ladder: Ladder = "nested",
@@ -34,9 +34,9 @@ def export(
 ) -> None:
     """Write Gaussians for other viewers: the planned scene, one level, all levels, or their increments.
 
-    The name of OUT chooses the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, or
-    FOLDER/lod-meta.json, which holds all levels. Categories are kept: in a file beside (OUT.labels.json), or
-    inside an .spz and a .glb.
+    The name of OUT chooses the format: .ply, .compressed.ply, .spz, .sog, .glb, .splat, .rad;
+    FOLDER/lod-meta.json and .ssog hold all levels. Categories are kept: in a file beside (OUT.labels.json),
+    or inside an .spz, an .ssog and a .glb.
 
     Args:
         run: run folder
@@ -48,9 +48,9 @@ def export(
         target_fidelity: write the scene planned for this fidelity (default: for the budget, else the main
             target)
         target_ssim: write the scene planned for this SSIM against photos
-        levels: numbers of the levels that lod-meta.json gets (default: all)
-        rasterize_mode: how viewers of the file draw (default: as the run was trained for .spz, .sog and
-            lod-meta.json, which say it; else classic, as most do)
+        levels: numbers of the levels that lod-meta.json or .ssog gets (default: all)
+        rasterize_mode: how viewers of the file draw (default: as PlayCanvas's engine does for lod-meta.json
+            and .ssog, else as the run was trained for .spz and .sog, which say it, else classic, as most do)
         labels_inside: write the categories into the .ply, as a property and comments; viewers that rely on
             the published layout then fail
         doubles: write x y z of a .ply as doubles in the capture's own coordinates, such as UTM; viewers that

@@ -177,7 +177,7 @@ def write_compressed_ply(
         rest = g.shN.transpose(1, 2).reshape(count, 3 * bases).double().numpy()
         sh: np.ndarray = np.empty(count, [(f"f_rest_{i}", "u1") for i in range(3 * bases)])
         for i, name in enumerate(sh.dtype.names or ()):
-            sh[name] = np.floor((rest[:, i] / 8 + 0.5) * 256).clip(0, 255)
+            sh[name] = _dithered(rest[:, i])
         elements.append(("sh", sh))
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += ["comment SplatRenderMode: mip"] if antialiased else []
@@ -232,6 +232,16 @@ def _words(shares: np.ndarray, fields: np.ndarray) -> np.ndarray:
     most = (1 << fields[:, 1].astype(np.int64)) - 1
     values = np.rint(shares * most).clip(0, most).astype(np.uint32)
     return (values << fields[:, 0]).sum(1, dtype=np.uint32)
+
+
+def _dithered(values: np.ndarray) -> np.ndarray:
+    """Bytes of harmonics [N]; what one is rounded by is made up for by the next.
+
+    The format has no 0, only 1/64 on either side of it: rounding each by itself would turn most, which are
+    small, the same way, and the picture with them.
+    """
+    sums = np.rint(np.cumsum(((values / 8 + 0.5) * 256 - 0.5).clip(0, 255)))
+    return np.diff(sums, prepend=0.0).clip(0, 255).astype(np.uint8)
 
 
 def _harmonics(values: np.ndarray) -> np.ndarray:

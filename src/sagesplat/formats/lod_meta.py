@@ -1,10 +1,12 @@
 """Streamed SOG, PlayCanvas's levels of detail: `lod-meta.json` and a SOG scene for each part of each level.
 
-    {"lodLevels": 7, "filenames": ["0_0/meta.json", ...], "environment": null, "tree": NODE}
+    {"version": 1, "count": 364, "counts": [312, 52], "lodLevels": 2, "filenames": ["0_0/meta.json", ...],
+     "environment": "env/meta.json", "tree": NODE}
 
 Level 0 is the finest. A NODE of the tree has a `bound` and `children`, or it is a leaf: `lods` says for each
-level which rows of which file are in it ({"0": {"file": 0, "offset": 0, "count": 248155}, ...}).
-`environment` is a SOG scene that is shown with every level, such as a sky.
+level which rows of which file are in it ({"0": {"file": 0, "offset": 0, "count": 312}, ...}). `environment`,
+if it is there, is a SOG scene that is shown with every level, such as a sky. Writers of a time before had
+null in its place, or `errors` of the leaves by level (`lodErrors`), which engines no longer use.
 """
 
 from collections import defaultdict

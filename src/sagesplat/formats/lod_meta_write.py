@@ -1,6 +1,7 @@
 """Writes streamed SOG, levels of detail for PlayCanvas's viewers; `lod_meta.py` has the layout."""
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ from jaxtyping import Float32
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians, relabelled
 from sagesplat.formats.lod_meta import LOD_META
-from sagesplat.formats.sog_write import GENERATOR, put_sog, sog_files, sog_order
+from sagesplat.formats.sog import META
+from sagesplat.formats.sog_write import GENERATOR, archived, sog_files, sog_order, with_labels_beside
 from sagesplat.formats.splat import SplatWriter
-from sagesplat.io.files import atomic_folder, write_json
+from sagesplat.io.files import atomic_folder
 
 FILE = 2**15  # Gaussians in a file, unless a cell has more: viewers fetch whole files
 _SIGMAS = 3  # that bounds enclose
@@ -50,41 +52,75 @@ def write_lod_meta(
     Raises:
         DataError: For a level without Gaussians, and as in `write_sog`.
     """
+    total = 0
+    with atomic_folder(folder) as fresh:
+        for name, content in _contents(
+            str(folder), levels, label_of, names or {}, parents or {}, antialiased, largest
+        ):
+            (fresh / name).parent.mkdir(exist_ok=True)
+            (fresh / name).write_bytes(content)
+            total += len(content)
+    return total
+
+
+def write_ssog(
+    path: Path,
+    levels: Sequence[Gaussians],
+    label_of: Mapping[int, int],
+    names: Mapping[int, str] | None = None,
+    *,
+    parents: Mapping[int, str] | None = None,
+    antialiased: bool = False,
+) -> int:
+    """Write levels of detail as a streamed SOG in one file: a ZIP of what `write_lod_meta` writes, stored.
+
+    The same input gives the same bytes. Returns the size in bytes; other arguments and errors are those of
+    `write_lod_meta`.
+    """
+    return archived(
+        path, _contents(str(path), levels, label_of, names or {}, parents or {}, antialiased, FILE)
+    )
+
+
+def _contents(
+    name: str,
+    levels: Sequence[Gaussians],
+    label_of: Mapping[int, int],
+    names: Mapping[int, str],
+    parents: Mapping[int, str],
+    antialiased: bool,
+    largest: int,
+) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of all files, `lod-meta.json` last; errors call the scene `name`."""
     levels = [g.detach().to("cpu") for g in levels]
     if not levels or not all(map(len, levels)):
-        raise DataError(f"{folder}: a level without Gaussians; leave it out")
+        raise DataError(f"{name}: a level without Gaussians; leave it out")
     cells = {cell for g in levels for cell in g.counts()}
     leaves: dict[int, dict[str, Any]] = {
         cell: {"lods": {}} for cell in sorted(cells, key=lambda cell: (label_of[cell], cell))
     }
     files: list[str] = []
-    with atomic_folder(folder) as fresh:
-        for lod, g in enumerate(levels):
-            rows = _rows(g, leaves)
-            _widen(leaves, _extents(g), rows)
-            for number, part in enumerate(_files(rows, largest)):
-                name, first = f"{lod}_{number}", 0
-                for cell in part:
-                    count = len(rows[cell])
-                    leaves[cell]["lods"][str(lod)] = {"file": len(files), "offset": first, "count": count}
-                    first += count
-                inside = relabelled(
-                    g.select(torch.from_numpy(np.concatenate([rows[c] for c in part]))), label_of
-                )
-                (fresh / name).mkdir()
-                made = sog_files(inside, name=f"{folder / name}", antialiased=antialiased)
-                put_sog(fresh / name, made, inside, names or {}, parents or {})
-                files.append(f"{name}/meta.json")
-        write_json(fresh / LOD_META, _document(levels, files, _tree(leaves, label_of, names or {})))
-        return sum(path.stat().st_size for path in fresh.rglob("*") if path.is_file())
+    for lod, g in enumerate(levels):
+        rows = _rows(g, leaves)
+        _widen(leaves, _extents(g), rows)
+        for number, part in enumerate(_files(rows, largest)):
+            folder, first = f"{lod}_{number}", 0
+            for cell in part:
+                count = len(rows[cell])
+                leaves[cell]["lods"][str(lod)] = {"file": len(files), "offset": first, "count": count}
+                first += count
+            inside = relabelled(g.select(torch.from_numpy(np.concatenate([rows[c] for c in part]))), label_of)
+            made = sog_files(inside, name=f"{name}/{folder}", antialiased=antialiased)
+            for file, content in with_labels_beside(made, inside, names, parents).items():
+                yield f"{folder}/{file}", content
+            files.append(f"{folder}/{META}")
+    yield LOD_META, json.dumps(_document(levels, files, _tree(leaves, label_of, names))).encode()
 
 
 def _document(levels: Sequence[Gaussians], files: list[str], tree: dict[str, Any]) -> dict[str, Any]:
     counts = [len(g) for g in levels]
     document = {"version": 1, "asset": {"generator": GENERATOR}, "count": sum(counts), "counts": counts}
-    return document | {
-        "lodLevels": len(levels), "lodErrors": False, "environment": None, "filenames": files, "tree": tree
-    }  # fmt: skip
+    return document | {"lodLevels": len(levels), "filenames": files, "tree": tree}
 
 
 def _rows(g: Gaussians, leaves: Mapping[int, object]) -> dict[int, np.ndarray]:
@@ -135,11 +171,12 @@ def _widen(
 
 
 def _around(bounds: Sequence[Mapping[str, list[float]]]) -> dict[str, list[float]]:
-    """The bound of several."""
+    """The bound of several, in the seven digits that the format has."""
+    low = np.min([bound["min"] for bound in bounds], axis=0)
+    high = np.max([bound["max"] for bound in bounds], axis=0)
     return {
-        "min": [min(values) for values in zip(*(bound["min"] for bound in bounds), strict=True)],
-        "max": [max(values) for values in zip(*(bound["max"] for bound in bounds), strict=True)],
-    }
+        "min": [float(f"{value:.7g}") for value in low], "max": [float(f"{value:.7g}") for value in high]
+    }  # fmt: skip
 
 
 def _tree(
@@ -159,5 +196,10 @@ def _tree(
 WRITER = SplatWriter(
     write_levels=lambda path, levels, label_of, names, parents, antialiased: write_lod_meta(
         path.parent, levels, label_of, names, parents=parents, antialiased=antialiased
+    )
+)
+SSOG_WRITER = SplatWriter(
+    write_levels=lambda path, levels, label_of, names, parents, antialiased: write_ssog(
+        path, levels, label_of, names, parents=parents, antialiased=antialiased
     )
 )

@@ -8,6 +8,7 @@ from sagesplat.formats import (
     lod_meta,
     lod_meta_write,
     ply,
+    rad_write,
     sog,
     sog_write,
     spz,
@@ -32,6 +33,8 @@ WRITERS: dict[str, SplatWriter] = {
     ".glb": gltf_write.WRITER,
     ".compressed.ply": compressed_ply.WRITER,
     ".splat": dotsplat.WRITER,
+    ".rad": rad_write.WRITER,
+    ".ssog": lod_meta_write.SSOG_WRITER,
     lod_meta.LOD_META: lod_meta_write.WRITER,
 }
 """By the suffix of files, the longest that fits, or their whole name."""

@@ -9,7 +9,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import morton_order
 from sagesplat.core.sh import BASES
-from sagesplat.formats.labels import NO_PARENTS, write_or_remove_labels
+from sagesplat.formats.labels import as_json, sidecar, write_or_remove_labels
 from sagesplat.formats.quantisation import OTHERS
 from sagesplat.formats.sog import META
 from sagesplat.formats.splat import SplatWriter, check_writable
@@ -71,28 +71,30 @@ def write_sog(
     files = sog_files(g, name=str(path), antialiased=antialiased)
     if path.name == META:
         with atomic_folder(path.parent) as fresh:
-            put_sog(fresh, files, g, names or {}, parents or {})
+            for name, content in with_labels_beside(files, g, names or {}, parents or {}).items():
+                (fresh / name).write_bytes(content)
         return sum(map(len, files.values()))
-    with atomic_path(path) as temporary:
-        with zipfile.ZipFile(temporary, "w") as archive:
-            for name, content in files.items():
-                archive.writestr(zipfile.ZipInfo(name), content)  # of 1980: no time stamp
-        nbytes = temporary.stat().st_size
-        write_or_remove_labels(path, g.label_ids, names or {}, parents or {})
+    nbytes = archived(path, files.items())
+    write_or_remove_labels(path, g.label_ids, names or {}, parents or {})
     return nbytes
 
 
-def put_sog(
-    folder: Path,
-    files: Mapping[str, bytes],
-    g: Gaussians,
-    names: Mapping[int, str],
-    parents: Mapping[int, str] = NO_PARENTS,
-) -> None:
-    """Put the files of a SOG scene into a folder, with the labels beside."""
-    for name, content in files.items():
-        (folder / name).write_bytes(content)
-    write_or_remove_labels(folder / META, g.label_ids, names, parents)
+def archived(path: Path, files: Iterable[tuple[str, bytes]]) -> int:
+    """Write names and contents as a ZIP archive, stored, atomically; returns its size in bytes."""
+    with atomic_path(path) as temporary:
+        with zipfile.ZipFile(temporary, "w") as archive:
+            for name, content in files:
+                archive.writestr(zipfile.ZipInfo(name), content)  # of 1980: no time stamp
+        return temporary.stat().st_size
+
+
+def with_labels_beside(
+    files: Mapping[str, bytes], g: Gaussians, names: Mapping[int, str], parents: Mapping[int, str]
+) -> dict[str, bytes]:
+    """The files of a SOG scene by name, and its sidecar where rows have labels."""
+    if not bool((g.label_ids >= 0).any()):
+        return dict(files)
+    return {**files, sidecar(Path(META)).name: as_json(g.label_ids, names, parents)}
 
 
 def sog_order(g: Gaussians) -> Int64[np.ndarray, " N"]:

@@ -153,7 +153,7 @@ def write_splat(
     """Write Gaussians in the format that the suffix of a path says, with their labels; `read_splat` reads it.
 
     Args:
-        path: A .ply, .compressed.ply, .spz, .sog, .glb or .splat; replaced if it is there.
+        path: A .ply, .compressed.ply, .spz, .sog, .glb, .splat or .rad; replaced if it is there.
         gaussians: N Gaussians on any device.
         names: Category names by label id. With the labels they go into the file where its format has a place
             for them, else into one beside it, PATH.labels.json.
@@ -162,8 +162,8 @@ def write_splat(
         offset: What is to be added to all positions for those of the capture, written beside the file.
 
     Raises:
-        DataError: For another suffix, lod-meta.json, which holds several levels, and what the format cannot
-            hold.
+        DataError: For another suffix, lod-meta.json and .ssog, which hold several levels, and what the format
+            cannot hold.
         OSError: If a file cannot be written.
 
     Example:

@@ -111,7 +111,7 @@ def encode_spz(
     parents: Mapping[int, str] | None = None,
     name: str = "SPZ",
 ) -> bytes:
-    """Encode N Gaussians in COLMAP's axes as SPZ (Niantic). Version 3 leaves labels out.
+    """Encode N Gaussians in COLMAP's axes as SPZ (Niantic).
 
     Opacities are rounded to 1/255, log scales to 1/16 within [-10, 5.94], sh0 to 0.026 within [-3.33, 3.33],
     harmonics to 2^(1 - bits) within [-1, 1). Rows keep their order. Values outside are clipped. Harmonics of
@@ -127,9 +127,9 @@ def encode_spz(
             0.052, rotations to about half a degree. A tenth smaller, for 0.0008 to 0.0017 of SSIM on
             `garden`.
         frame: Axes to write: "rub" (right, up, back: SPZ's own) or "rdf" (right, down, front: COLMAP's).
-        version: 3 (gzip) or 4 (zstd). With `names`, version 4 keeps the labels as an extension record, which
-            other readers skip.
-        names: Category names by label id, for version 4.
+        version: 3 (gzip), which all readers take, or 4 (zstd), a twentieth smaller, which Spark 2.2 does not.
+        names: Category names by label id; with them the labels are kept as an extension record, which other
+            readers skip.
         parents: Names of the categories that instances are of, by the instance's label id; likewise.
         name: What errors call the file.
 
@@ -167,12 +167,11 @@ def encode_spz(
         _bytes(128 + 128 * in_buckets(torch.from_numpy(harmonics), sh_bits)),
     ]
     flags = ANTIALIASED if antialiased else 0
-    if version == 3:
-        return gzipped(len(g), g.sh_degree, bits, flags, attributes)
     records = {} if names is None else {_LABELS: as_json(g.label_ids, names, parents or {})}
-    if frame != "rub":
+    if version == 4 and frame != "rub":
         records[_AXES] = _FRAMES.index(frame, 1).to_bytes(4, "little")
-    return zstd_packed(len(g), g.sh_degree, bits, flags, attributes, records)
+    pack = gzipped if version == 3 else zstd_packed
+    return pack(len(g), g.sh_degree, bits, flags, attributes, records)
 
 
 def position_step(g: Gaussians) -> tuple[float, float]:
@@ -343,6 +342,6 @@ READER = SplatReader(
 )
 WRITER = SplatWriter(
     lambda path, g, names, parents, antialiased: write_spz(
-        path, g, version=4, names=names, parents=parents, antialiased=antialiased
+        path, g, names=names, parents=parents, antialiased=antialiased
     )
 )

@@ -26,6 +26,7 @@ _STREAM = struct.Struct("<QQ")
 _RECORD = struct.Struct("<II")
 _EXPANDS = 1032  # largest expansion ratio of a deflate stream; zstd's is not bounded, nor needed
 _FREE = 2**16  # bytes that any version 4 may unpack to
+_RECORDS = 16  # bytes for each Gaussian that records may have beyond: a label each, as JSON
 _WINDOW = 2**27  # bytes that a zstd frame may look back, at most
 _LEVEL = 12  # of zstd; 19 takes ten times as long for 3 % less
 
@@ -44,13 +45,25 @@ class Packed:
     extensions: dict[int, bytes] = field(default_factory=dict)  # by type
 
 
-def gzipped(count: int, degree: int, bits: int, flags: int, attributes: Sequence[np.ndarray]) -> bytes:
+def gzipped(
+    count: int,
+    degree: int,
+    bits: int,
+    flags: int,
+    attributes: Sequence[np.ndarray],
+    extensions: dict[int, bytes],
+) -> bytes:
     """Version 3. The same input gives the same bytes."""
+    flags |= _EXTENSIONS if extensions else 0
     packer = zlib.compressobj(9, zlib.DEFLATED, 31, 9, zlib.Z_FILTERED)  # 31: gzip, without a time stamp
     content = packer.compress(HEADER.pack(MAGIC, 3, count, degree, bits, flags, 0))
     for attribute in attributes:  # separate deflate blocks, each with its own codes: 5 % smaller
         content += packer.compress(attribute.tobytes()) + packer.flush(zlib.Z_BLOCK)
-    return content + packer.flush()
+    return content + packer.compress(b"".join(_packed_records(extensions))) + packer.flush()
+
+
+def _packed_records(extensions: dict[int, bytes]) -> list[bytes]:
+    return [_RECORD.pack(kind, len(content)) + content for kind, content in extensions.items()]
 
 
 def zstd_packed(
@@ -67,7 +80,7 @@ def zstd_packed(
     packer = zstandard.ZstdCompressor(level=_LEVEL)
     sizes = [attribute.nbytes for attribute in attributes if attribute.size]  # empty streams are left out
     streams = [packer.compress(attribute.tobytes()) for attribute in attributes if attribute.size]
-    records = [_RECORD.pack(kind, len(content)) + content for kind, content in extensions.items()]
+    records = _packed_records(extensions)
     flags |= _EXTENSIONS if records else 0
     table = _HEADER_4.size + sum(map(len, records))
     header = _HEADER_4.pack(MAGIC, 4, count, degree, bits, flags, len(streams), table)
@@ -96,7 +109,7 @@ def _ungzipped(name: str, content: bytes) -> Packed:
         size = count * sum(widths)
         if count > MAX_COUNT or size > _EXPANDS * len(content):
             raise DataError(f"{name}: {count} Gaussians announced, more than fit; copy it again")
-        more = _FREE if flags & _EXTENSIONS else 0
+        more = _FREE + _RECORDS * count if flags & _EXTENSIONS else 0
         body = unpacker.decompress(unpacker.unconsumed_tail, size + more + 1)  # 1: to detect excess data
     except zlib.error as error:
         raise DataError(f"{name}: not gzip, or damaged ({error}); give an .spz of version 1 to 4") from None

@@ -5,10 +5,11 @@ from pathlib import Path
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.offsets import write_offset
 from sagesplat.formats.ply import write_ply
-from sagesplat.raster.classic import for_classic
+from sagesplat.raster.classic import for_classic, for_playcanvas
 from sagesplat.run.job import Job
 from sagesplat.run.records import settings_of
 from sagesplat.run.stage import run_stage
+from sagesplat.scene.scene import Camera
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_plan
 from sagesplat.stages.shared import label_image_inputs, train_config
@@ -34,8 +35,17 @@ def classic(job: Job, g: Gaussians) -> Gaussians:
     """`g` for viewers that draw without antialiasing, whatever the run was trained with."""
     if not job.antialiased:
         return g
+    return for_classic(g, _cameras(job))
+
+
+def for_engine(job: Job, g: Gaussians) -> Gaussians:
+    """`g` for PlayCanvas's engine with its own settings, whatever the run was trained with."""
+    return for_playcanvas(classic(job, g), _cameras(job))
+
+
+def _cameras(job: Job) -> list[Camera]:
     rows = spread(job.scene.train_ids.tolist(), _VIEWS)
-    return for_classic(g, (job.scene.views[row].camera for row in rows))
+    return [job.scene.views[row].camera for row in rows]
 
 
 def compose_plan(job: Job) -> None:

@@ -34,7 +34,7 @@ from sagesplat.formats.splats import write_splat, writer_of
 from sagesplat.raster import device_of, rasterize
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
-from sagesplat.stages.compose import classic
+from sagesplat.stages.compose import classic, for_engine
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.plan import main_plan, scene_plan
 from sagesplat.stages.shared import labels_named
@@ -42,7 +42,7 @@ from sagesplat.train.cells import cells_wanted, split_cells
 from sagesplat.train.early_stopping import spread
 
 _HOLE_VIEWS = 16  # training views in which holes are counted
-RasterizeMode = Literal["classic", "antialiased"]  # gsplat's names
+RasterizeMode = Literal["classic", "antialiased", "playcanvas"]  # the first two are gsplat's names
 
 
 def export_increments(job: Job, folder: Path, kind: FileFormat) -> int:
@@ -104,10 +104,11 @@ def export_scene(
     `labels` (none: all) and `without` name categories or instances; a category means its instances too. What
     is left out leaves holes, which an event names.
 
-    `rasterize_mode`: how the file will be drawn; None: as the run was trained where the format says so, else
-    `classic`. `lod-meta.json` gets `levels`, or all there are, as levels of detail. `labels_inside`: a PLY
-    has the labels as a property, not beside it. `doubles`: positions of a PLY are doubles in the capture's
-    own coordinates. Returns the number of Gaussians.
+    `rasterize_mode`: how the file will be drawn; None: levels of detail as by PlayCanvas's engine, scenes as
+    the run was trained where the format says so, else `classic`. `lod-meta.json` and `.ssog` get `levels`,
+    or all there are, as levels of detail. `labels_inside`: a PLY has the labels as a property, not beside it.
+    `doubles`: positions of a PLY are doubles in the capture's own coordinates. Returns the number of
+    Gaussians.
     """
     writer = writer_of(path)
     for given, name in ((labels_inside, "labels-inside"), (doubles, "doubles")):
@@ -115,9 +116,7 @@ def export_scene(
             raise RunError(f"{path}: --{name} is for .ply; leave it out")
     if rasterize_mode == "antialiased" and not job.antialiased:
         raise RunError(f"{job.run.path}: trained without antialiasing; leave out --rasterize-mode")
-    if rasterize_mode == "classic" and writer.write_levels:
-        raise RunError(f"{path}: says how it is drawn; leave out --rasterize-mode")
-    if writer.write_levels:
+    if path.name == LOD_META:
         _check_folder(job, path.parent)
     elif path.exists() and not job.force:
         raise RunError(f"{path}: exists; add --force to replace it")
@@ -127,9 +126,9 @@ def export_scene(
     if not wanted:
         raise RunError(f"{path}: no category is left; leave out some of --without")
     if writer.write_levels:
-        return _export_levels(job, path, writer.write_levels, levels, wanted)
+        return _export_levels(job, path, writer.write_levels, levels, wanted, rasterize_mode or "playcanvas")
     if levels:
-        raise RunError(f"{path}: levels are for {LOD_META}; name one with --level")
+        raise RunError(f"{path}: levels are for {LOD_META} and .ssog; name one with --level")
     if level is not None:
         whole = job.ladder.load(level)
     else:
@@ -141,8 +140,7 @@ def export_scene(
     if g.sh_degree > writer.sh_degree and bool(g.shN.any()):
         job.emit(Warned(f"{path}: the format holds no harmonics, which are left out"))
     offset, mode = job.scene.offset, rasterize_mode or ("antialiased" if writer.antialiases else "classic")
-    antialiased = mode == "antialiased" and job.antialiased
-    g = g if antialiased else classic(job, g)
+    g, antialiased = _drawn(job, g, mode)
     kept = {"parents": job.parents_by_id, "antialiased": antialiased}
     if labels_inside:
         write_ply(path, g, job.names(), **kept, labels_inside=True)
@@ -187,8 +185,20 @@ def _check_folder(job: Job, folder: Path) -> None:
         raise RunError(f"{folder}: not empty; choose a new folder (--force replaces one that export wrote)")
 
 
+def _drawn(job: Job, g: Gaussians, mode: RasterizeMode) -> tuple[Gaussians, bool]:
+    """The Gaussians for a way of drawing, and whether it antialiases."""
+    if mode == "antialiased" and job.antialiased:
+        return g, True
+    return (for_engine if mode == "playcanvas" else classic)(job, g), False
+
+
 def _export_levels(
-    job: Job, path: Path, write: WriteLevels, levels: Sequence[int], wanted: Sequence[int]
+    job: Job,
+    path: Path,
+    write: WriteLevels,
+    levels: Sequence[int],
+    wanted: Sequence[int],
+    mode: RasterizeMode,
 ) -> int:
     chosen = sorted(set(levels) or job.ladder.levels, reverse=True)  # the finest is level of detail 0
     if isinstance(job.ladder, NestedLadder):
@@ -197,7 +207,9 @@ def _export_levels(
     else:
         sets, label_of = _in_cells([job.ladder.load(level, wanted) for level in chosen])
     sets = [g for i, g in enumerate(sets) if len(g) and (i == 0 or len(g) < len(sets[i - 1]))]
-    write(path, sets, label_of, job.names(), job.parents_by_id, job.antialiased)
+    drawn = [_drawn(job, g, mode) for g in sets]
+    antialiased = any(one for _, one in drawn)
+    write(path, [g for g, _ in drawn], label_of, job.names(), job.parents_by_id, antialiased)
     write_offset(path, job.scene.offset)
     _say_offset(job, f"written to {beside(path).name}")
     return len(sets[0]) if sets else 0

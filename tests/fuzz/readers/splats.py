@@ -42,7 +42,8 @@ def _ply(folder: Path, size: int) -> list[bytes]:
 def _spz(folder: Path, size: int) -> list[bytes]:
     if size > 1:  # the best that gzip can do: nothing but zeros
         return [encode_spz(_equal(3 * size))]
-    return [encode_spz(splats()), encode_spz(splats(bases=0), coarse=True)]
+    labelled = encode_spz(splats(), names={1: "tree"})
+    return [encode_spz(splats()), encode_spz(splats(bases=0), coarse=True), labelled]
 
 
 def _streams(folder: Path, size: int) -> list[bytes]:
