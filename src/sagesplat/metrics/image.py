@@ -63,7 +63,8 @@ def ssim_map(
         >>> bool(np.allclose(ssim_map(photo, photo), 1, atol=1e-5)), ssim_map(photo, 1 - photo).shape
         (True, (32, 48))
     """
-    return ssim_planes(x, y, tile_mask).mean(0)
+    red, green, blue = ssim_planes(x, y, tile_mask)
+    return (red + green + blue) / np.float32(3)  # numpy's mean takes five times as long
 
 
 def ssim_planes(

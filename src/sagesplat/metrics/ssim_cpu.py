@@ -1,8 +1,8 @@
 """SSIM fused with its gradient: 11x11 Gaussian window, sigma 1.5, zero padding, RGB in [0, 1], as in 3DGS.
 
 Images and maps are planes [3, H, W'] (`kernels/planes.py`) that hold zeros beyond column W. Tiles are copied
-near in groups, blurred down the columns, then along the rows. Where both images are zero all around, as beside
-an object, the result is known without.
+near in groups, blurred down the columns, then along the rows. Where both images are zero all around, as they
+are beside an object, the result is known without.
 """
 
 import numpy as np
