@@ -16,9 +16,8 @@ from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.results import has_photos
 from sagesplat.stages.shared import label_image_inputs
-from sagesplat.train.early_stopping import spread
 
-_OBSERVED = 24  # training views of a splat without photos in which all levels are measured
+_OBSERVED = 3  # of so many training views of a splat without photos one is measured at all levels
 
 
 def observe_levels(job: Job, config: FitConfig) -> None:
@@ -62,7 +61,7 @@ def _last_only(job: Job) -> set[int]:
     if has_photos(job.run):
         return set()
     train = job.scene.train_ids.tolist()
-    return set(train) - set(spread(train, _OBSERVED))
+    return set(train) - set(train[1::_OBSERVED])  # not those alone that levels are fitted to (`spread`)
 
 
 def _observe_views(
