@@ -262,3 +262,19 @@ def test_impossible_arguments(wrong):
 def test_quantiles_by_weight():
     values, weights = np.array([3.0, 1.0, 2.0]), np.array([1.0, 8.0, 1.0])
     assert [weighted_quantile(values, weights, q) for q in (0, 0.5, 0.85, 1)] == [1, 1, 2, 3]
+
+
+def test_small_renders_of_many_gaussians_draw_some_that_cover_as_much(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    g = ball(count=3000)
+    cameras = free_cameras(g, 6, kind="object").cameras
+    monkeypatch.setattr(free_viewpoints, "_MANY", 1000)
+    fewer = free_viewpoints._fewer(g)
+    assert len(fewer) == 1000
+    for camera in cameras:
+        small = camera.within(96)
+        full, some = (float((rasterize(one, small).alpha > 0.5).float().mean()) for one in (g, fewer))
+        assert some == pytest.approx(full, rel=0.1)
+    again = free_cameras(g, 6, kind="object").cameras
+    assert all(np.array_equal(a.w2c, b.w2c) for a, b in zip(cameras, again, strict=True))

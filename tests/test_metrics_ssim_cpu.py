@@ -118,3 +118,22 @@ def test_tiles_that_leave_the_loss(size):
         again = x.clone().requires_grad_()
         photometric_loss(again, y, 0.2, tiles, space).backward()
         assert torch.equal(again.grad, rgb.grad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_black_surroundings_change_nothing(masked):
+    """What is black all around is not blurred: map, loss and gradient are those of the plain formula."""
+    x, y = torch.zeros(2, 90, 200, 3)
+    x[40:55, 70:85], y[43:60, 72:90] = pair(15, 15)[0], pair(17, 18, 2)[1]
+    exact, rgb = x.double().requires_grad_(), x.clone().requires_grad_()
+    expected = plain_ssim(exact, y.double())
+    np.testing.assert_allclose(ssim_map(x.numpy(), y.numpy()), expected.mean(-1).detach(), atol=1e-5)
+    (1 - expected.mean()).backward()
+    mask = np.ones((6, 13), bool)
+    mask[:, -1] = not masked  # black in both
+    photometric_loss(rgb, y, 1.0, mask).backward()
+    assert exact.grad is not None
+    assert rgb.grad is not None
+    assert (rgb.grad - exact.grad).abs().max() < 2e-4 * exact.grad.abs().max()
+    assert not rgb.grad[:16].any()
+    assert not rgb.grad[:, 128:].any()

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from conftest import job_of
 
+from sagesplat.adapt import fidelity
 from sagesplat.adapt.cell_models import expect, promised
 from sagesplat.adapt.fidelity import measure_compositions, measure_levels
-from sagesplat.adapt.observe import RenderedLabels
+from sagesplat.adapt.observe import RenderedLabels, observe
 from sagesplat.adapt.viewpoints import Rule, draw, read_viewpoints
 from sagesplat.core.config import FitConfig, SampleConfig
 from sagesplat.core.errors import RunError
@@ -73,6 +74,34 @@ def test_the_levels_are_compared_with_the_full_model(job: Job):
     np.testing.assert_allclose(composed[:, 0, :-1], found[..., 0], atol=1e-6)
     np.testing.assert_allclose(composed[:, 1, -1], 1, atol=1e-6)
     np.testing.assert_array_equal(composed[:, 1], composed[:, 3])
+
+
+@pytest.mark.parametrize("keep_levels", [0, 10**8])
+def test_kept_pictures_are_compared_like_new_ones(
+    job: Job, monkeypatch: pytest.MonkeyPatch, keep_levels: int
+):
+    monkeypatch.setattr(fidelity, "_KEEP_LEVELS", keep_levels)
+    cameras = viewpoints_of(job).cameras[:2]
+    planned = np.array([[[1, 1], [1, 4]]] * 2)
+    expected, pixels = measure_compositions(job.by_cell, cameras, planned, backend="cpu")
+    references = fidelity.References(job.by_cell, "cpu", False)
+    for _ in range(2):
+        found, same = measure_compositions(
+            job.by_cell, cameras, planned, backend="cpu", references=references
+        )
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(same, pixels)
+    assert [bool(one.levels) for one in references._kept.values()] == [keep_levels > 0] * 2
+
+
+def test_some_views_are_observed_at_the_last_level_alone(job: Job):
+    given = job.scene, job.photos, job.level_masks, job.ladder, job.distances("percentile")
+    every = observe(*given, views=[0, 1], backend="cpu")
+    fewer = observe(*given, views=[0, 1], last_only={1}, backend="cpu")
+    assert set(fewer.level[fewer.view == 1].tolist()) == {4}
+    expected = every.select((every.view == 0) | (every.level == 4))
+    for name, column in vars(expected).items():
+        np.testing.assert_array_equal(getattr(fewer, name), column)
 
 
 def test_done_once_and_again_with_other_settings(job: Job):

@@ -7,7 +7,7 @@ The full model is the last level; of a splat that was adopted it is what came in
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,8 @@ from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 
-_KEEP = 5 * 10**8  # bytes of references that are kept
+_KEEP = 2 * 10**8  # bytes of the full model's pictures that are kept
+_KEEP_LEVELS = 10**8  # of what levels are rendered from: for many Gaussians it takes as much as 20 pictures
 PROMISED_SHARE = 2e-3  # of a picture that a category has to cover: of fewer pixels nothing is promised
 
 
@@ -180,9 +181,8 @@ class Reference:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it holds, about."""
-        seen = self.levels.nbytes if self.levels else 0
-        return self.image.nbytes + self.label_ids.nbytes + seen
+        """Memory that it holds besides the levels, about."""
+        return self.image.nbytes + self.label_ids.nbytes
 
 
 class References:
@@ -203,10 +203,11 @@ class References:
         """
         self.labels = sorted({label for label, _ in ladder.counts})
         self.wanted = np.array([only is None or label in only for label in self.labels])
-        self._ladder, self._antialiased, self._left = ladder, antialiased, keep
+        self._ladder, self._antialiased = ladder, antialiased
+        self._left, self._left_levels = keep, min(keep, _KEEP_LEVELS)
         self._backend: Backend = backend
         self._given = full
-        self._workspace, self._kept = Workspace(), {}
+        self._workspace, self._kept = Workspace(), dict[tuple[object, ...], Reference]()
 
     @cached_property
     def _last(self) -> RenderedLabels:
@@ -223,28 +224,39 @@ class References:
     def at(self, camera: Camera) -> Reference:
         """The full model's image and label image, and its levels, from a viewpoint."""
         key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
-        if key in self._kept:
-            return self._kept[key]
+        kept = self._kept.get(key)
+        found = kept or self._pictures(camera)
+        if found.levels is None and isinstance(self._ladder, PrefixLadder):
+            found = replace(found, levels=self._seen(camera, found.tile_mask))
+        if kept is None and found.nbytes <= self._left:
+            self._left -= found.nbytes
+            stays = found.levels is not None and found.levels.nbytes <= self._left_levels
+            if found.levels is not None and stays:
+                self._left_levels -= found.levels.nbytes
+            self._kept[key] = found if stays else replace(found, levels=None)
+        return found
+
+    def _seen(self, camera: Camera, tile_mask: np.ndarray | None) -> Seen:
+        assert isinstance(self._ladder, PrefixLadder)
+        return seen_from(
+            self._ladder, camera, backend=self._backend, antialiased=self._antialiased,
+            workspace=self._workspace, tile_mask=tile_mask,
+        )  # fmt: skip
+
+    def _pictures(self, camera: Camera) -> Reference:
+        """The full model's image and label image, with the levels where the latter is made from them."""
         tile_mask, levels, label_ids = None, None, None
         if not self.wanted.all():
             label_ids = self._last.render(camera)
             tile_mask = tiles_around(np.isin(label_ids, np.array(self.labels)[self.wanted]))
         image = self._full.paint(camera, tile_mask)
-        if isinstance(self._ladder, PrefixLadder):
-            levels = seen_from(
-                self._ladder, camera, backend=self._backend, antialiased=self._antialiased,
-                workspace=self._workspace, tile_mask=tile_mask,
-            )  # fmt: skip
-        if label_ids is None and levels:
+        if label_ids is None and isinstance(self._ladder, PrefixLadder):
+            levels = self._seen(camera, tile_mask)
             label_ids = levels.label_ids(dict.fromkeys(self.labels, self._ladder.levels[-1]))
         label_ids = self._last.render(camera) if label_ids is None else label_ids
         counts = np.bincount(label_ids.ravel().astype(np.int64) - UNLABELLED, minlength=2 + max(self.labels))
         pixels = counts[np.array(self.labels) - UNLABELLED].astype(np.int32)
-        found = Reference(image, label_ids, pixels, levels, tile_mask)
-        if found.nbytes <= self._left:
-            self._left -= found.nbytes
-            self._kept[key] = found
-        return found
+        return Reference(image, label_ids, pixels, levels, tile_mask)
 
     def compare(
         self, levels: Mapping[int, int], camera: Camera, at: Reference

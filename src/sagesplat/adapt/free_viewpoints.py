@@ -44,6 +44,7 @@ _SKY = 20.0  # units; what is farther surrounds nobody
 _PLACE = 0.2  # of free space is surrounded
 
 _SMALL = 96  # px, longer side of the renders that viewpoints are checked by
+_MANY = 100_000  # Gaussians of these renders; of more, every so many are drawn, each as much larger
 _SEEN = {"object": 0.01, "place": 0.5}  # least share of the image that is covered
 _MOST_NEAR = 0.3  # of what is seen may be closer than CLEAR
 _SMALLEST = 0.02  # world units; here the nearest orbits keep clear of the near plane
@@ -167,6 +168,15 @@ def _world_pose(w2c: np.ndarray, cloud: Cloud) -> np.ndarray:
     return w2c.astype(np.float32)
 
 
+def _fewer(g: Gaussians) -> Gaussians:
+    """At most about `_MANY` Gaussians that cover as much."""
+    step = len(g) // _MANY
+    if step < 2:
+        return g
+    some = g.select(torch.arange(0, len(g), step))
+    return replace(some, log_scales=some.log_scales + math.log(step) / 2)
+
+
 class _Check:
     """Whether a pose sees enough, in a small render."""
 
@@ -179,7 +189,11 @@ class _Check:
         kind: Literal["object", "place"],
         backend: Backend,
     ):
-        self.g, self.least, self.backend = in_units(g, cloud).to(device_of(backend)), _SEEN[kind], backend
+        self.g, self.least, self.backend = (
+            _fewer(in_units(g, cloud)).to(device_of(backend)),
+            _SEEN[kind],
+            backend,
+        )
         side = min(1.0, _SMALL / max(size))
         small = max(1, round(size[0] * side)), max(1, round(size[1] * side))
         self.camera = Camera(np.eye(4, dtype=np.float32), K, *size).resized(*small)

@@ -186,6 +186,9 @@ class RenderedLabels:
         ids, columns = self._columns
         drawn, rows = drawn_from(self.gaussians, None, {}, camera, self.antialiased, self._workspace)
         everything = [(0, len(rows), 0.0)]
+        if len(ids) == 2 and UNLABELLED not in self.gaussians.counts():  # what does not shine through
+            image = drawn.render(everything)
+            return image, ids[(drawn.remains < 0.5).astype(np.int64)]
         painted = ids[drawn.most_painted(everything, columns.numpy()[rows], len(ids))]
         return drawn.render(everything), painted
 
@@ -305,6 +308,7 @@ def observe(
     views: Sequence[int] | None = None,
     valid: ValidPixels = ALL_VALID,
     labels: Collection[int] | None = None,
+    last_only: Collection[int] = (),
     backend: Backend = "auto",
     antialiased: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -324,6 +328,7 @@ def observe(
         valid: The pixels that count.
         labels: Ids of the categories to measure: only the parts of images that show them are rendered, and
             views without them are not. None: all, and the full image.
+        last_only: Rows of views in which the last level alone is measured.
         backend: Rasteriser; decides the device.
         antialiased: How the model was trained.
         progress: Called with (images measured, images in all).
@@ -346,7 +351,8 @@ def observe(
         shown = {row: np.isin(masks[scene.views[row]], list(labels)) for row in views}
         tiles = {row: tiles_around(mine) for row, mine in shown.items() if mine.any()}
     inner = {row: erode(masks[scene.views[row]]) for row in tiles}
-    done, total = 0, len(ladder.levels) * len(tiles)
+    levels = {row: ladder.levels[-1:] if row in last_only else ladder.levels for row in tiles}
+    done, total = 0, sum(map(len, levels.values()))
 
     def compare(level: int, row: int, image: Float32[np.ndarray, "H W 3"]) -> list[dict[str, float]]:
         view = scene.views[row]
@@ -358,7 +364,7 @@ def observe(
             if labels is None or label in labels
         ]
 
-    for images, found in _each_image(compare, ladder, scene, tiles, backend, antialiased):
+    for images, found in _each_image(compare, ladder, scene, tiles, levels, backend, antialiased):
         rows += found
         done += images
         if progress:
@@ -376,34 +382,36 @@ def _each_image(
     ladder: Ladder,
     scene: Scene,
     views: Mapping[int, np.ndarray | None],
+    levels: Mapping[int, Sequence[int]],
     backend: Backend,
     antialiased: bool,
 ) -> Iterator[tuple[int, list[dict[str, float]]]]:
     """Call `compare` with level, view and image: view by view where levels share Gaussians, else level by
     level. Yields how many images there were, and what was returned.
 
-    `views`: by row the tiles that are wanted at least; None: all.
+    `views`: by row the tiles that are wanted at least; None: all. `levels`: by row.
     """
     how: dict[str, Any] = {"backend": backend, "antialiased": antialiased, "workspace": Workspace()}
     if isinstance(ladder, NestedLadder):
         cells = ladder.cells
 
-        def in_view(row: int) -> list[dict[str, float]]:
+        def in_view(row: int) -> tuple[int, list[dict[str, float]]]:
             seen = seen_from(cells, scene.views[row].camera, tile_mask=views[row], **how)
-            images = ((level, seen.render(dict.fromkeys(cells.sizes, level))) for level in ladder.levels)
-            return [found for level, image in images for found in compare(level, row, image)]
+            images = ((level, seen.render(dict.fromkeys(cells.sizes, level))) for level in levels[row])
+            return len(levels[row]), [
+                found for level, image in images for found in compare(level, row, image)
+            ]
 
-        yield from (
-            (len(ladder.levels), found) for found in each_view(in_view, list(views), device_of(backend))
-        )
+        yield from each_view(in_view, list(views), device_of(backend))
         return
     for level in ladder.levels:
         g = ladder.load(level).to(device_of(backend))
+        rows = [row for row in views if level in levels[row]]
 
         def at_level(row: int, level: int = level, g: Gaussians = g) -> list[dict[str, float]]:
             return compare(level, row, render_rgb(g, scene.views[row].camera, **how))
 
-        yield from ((1, found) for found in each_view(at_level, list(views), device_of(backend)))
+        yield from ((1, found) for found in each_view(at_level, rows, device_of(backend)))
 
 
 def merge(parts: Sequence[Observations]) -> Observations:

@@ -28,8 +28,8 @@ class Drawn:
     """N Gaussians as a camera draws them, at the larger of two opacities."""
 
     records: Float32[np.ndarray, "N 11"]  # see `raster.blend`
-    logits: Float32[np.ndarray, "N 2"]  # of the first opacity, and of the second one
-    filtered: Float32[np.ndarray, " N"]  # log2 of what antialiasing leaves of opacities
+    logits: Float32[np.ndarray, "N 2"]  # of the first opacity, and of the second one; no rows without that
+    filtered: Float32[np.ndarray, " N"]  # log2 of what antialiasing leaves of opacities; the same
     row_order: Int64[np.ndarray, " rows"]  # these three: see `raster.tiles.Intersections`
     starts: Int64[np.ndarray, " tiles+1"]
     ids: Int32[np.ndarray, " I"]
@@ -55,6 +55,12 @@ class Drawn:
         blend.forward(records, starts, ids, self.row_order, width, height, behind, image, left, ends)
         return to_image(np.clip(image, 0, 1, out=image), width).numpy()
 
+    @property
+    def remains(self) -> Float32[np.ndarray, "H W"]:
+        """Transmittance that the last image left, until the next one."""
+        camera = self.camera
+        return self.workspace.take("left", camera.height, padded(camera.width))[:, : camera.width]
+
     def most_painted(
         self, parts: Sequence[tuple[int, int, float]], columns_of: Int[np.ndarray, " N"], num_columns: int
     ) -> Int64[np.ndarray, "H W"]:
@@ -69,14 +75,16 @@ class Drawn:
 
     def _composed(self, parts: Sequence[tuple[int, int, float]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Records at the opacities of the parts, and the tile lists of what they show."""
-        take = self.workspace.take
-        records, shown = (
-            take("records", *self.records.shape),
-            take("shown", len(self.records), dtype=np.bool_),
-        )
+        take, records = self.workspace.take, self.records
+        shown = take("shown", len(records), dtype=np.bool_)
         shown.fill(False)
+        if len(self.logits):
+            records = take("records", *self.records.shape)
         for first, last, weight in parts:
             rows = slice(first, last)
+            if not len(self.logits):
+                shown[rows] = True
+                continue
             _compose(
                 self.records[rows], self.logits[rows], self.filtered[rows], _F(weight), records[rows],
                 shown[rows],
@@ -97,14 +105,15 @@ def drawn_from(
 ) -> tuple[Drawn, Int64[np.ndarray, " M"]]:
     """What `camera` sees of Gaussians with their `second` opacities (logits [N]), if any; and their rows."""
     first = g.logit_opacities
-    second = first if second is None else second
-    most = first.maximum(second)
+    most = first if second is None else first.maximum(second)
     rows, records, lists = cpu.seen(
         replace(g, logit_opacities=most), camera, workspace, antialiased=antialiased, tile_mask=tile_mask
     )
-    logits = np.stack([first.numpy()[rows], second.numpy()[rows]], 1)
-    opacities = 1 / (1 + np.exp(-logits.max(1).astype(np.float64)))
-    filtered = (records[:, 5] - np.log2(opacities)).astype(np.float32)
+    logits, filtered = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+    if second is not None:
+        logits = np.stack([first.numpy()[rows], second.numpy()[rows]], 1)
+        opacities = 1 / (1 + np.exp(-logits.max(1).astype(np.float64)))
+        filtered = (records[:, 5] - np.log2(opacities)).astype(np.float32)
     order, starts, ids = lists.row_order, lists.starts, lists.ids.copy()
     return Drawn(records, logits, filtered, order, starts, ids, weights, camera, workspace), rows
 

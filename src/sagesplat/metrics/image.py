@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from numba import prange
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
@@ -62,7 +63,8 @@ def ssim_map(
         >>> bool(np.allclose(ssim_map(photo, photo), 1, atol=1e-5)), ssim_map(photo, 1 - photo).shape
         (True, (32, 48))
     """
-    return ssim_planes(x, y, tile_mask).mean(0)
+    red, green, blue = ssim_planes(x, y, tile_mask)
+    return (red + green + blue) / np.float32(3)  # numpy's mean takes five times as long
 
 
 def ssim_planes(
@@ -100,9 +102,19 @@ def squared_error_map(
     x: Float32[np.ndarray, "H W 3"], y: Float32[np.ndarray, "H W 3"]
 ) -> Float32[np.ndarray, "H W"]:
     """Squared error at every pixel, averaged over the channels."""
-    squares = np.square(x - y)
-    red, green, blue = squares[..., 0], squares[..., 1], squares[..., 2]
-    return (red + green + blue) / 3  # a mean over an axis of three takes numpy twenty times as long
+    out = np.empty(x.shape[:2], np.float32)
+    _squared_errors(x, y, out)
+    return out
+
+
+@njit(parallel=True, cache=True)
+def _squared_errors(x, y, out):
+    for row in prange(len(out)):
+        for column in range(out.shape[1]):
+            red = x[row, column, 0] - y[row, column, 0]
+            green = x[row, column, 1] - y[row, column, 1]
+            blue = x[row, column, 2] - y[row, column, 2]
+            out[row, column] = (red * red + green * green + blue * blue) / np.float32(3)
 
 
 def psnr(mean_squared_error: float | np.ndarray) -> Any:

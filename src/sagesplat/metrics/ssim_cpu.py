@@ -1,7 +1,8 @@
 """SSIM fused with its gradient: 11x11 Gaussian window, sigma 1.5, zero padding, RGB in [0, 1], as in 3DGS.
 
 Images and maps are planes [3, H, W'] (`kernels/planes.py`) that hold zeros beyond column W. Tiles are copied
-near in groups, blurred down the columns, then along the rows.
+near in groups, blurred down the columns, then along the rows. Where both images are zero all around, as they
+are beside an object, the result is known without.
 """
 
 import numpy as np
@@ -100,6 +101,15 @@ def _take(values, hidden, tiles, start, strip, left, height, wide, patch, to):
             store(patch, to + r * _LINE + c, piece)
 
 
+@njit(cache=True)
+def _blank(bits, first, end):
+    """Whether all these floats, as their bits, are zero."""
+    any_bit = np.uint32(0)
+    for at in range(first, end):
+        any_bit |= bits[at]
+    return any_bit == 0
+
+
 @njit(parallel=True, cache=True)
 def compare(x, y, tiles, width, ssim, derivatives, sums):
     """SSIM of x, y [3, H, W'] into ssim, its derivatives [3, 3, H, W'], sums [3, strips].
@@ -112,13 +122,14 @@ def compare(x, y, tiles, width, ssim, derivatives, sums):
     for job in prange(strips * channels):
         channel, strip = job // strips, job % strips
         start, area = channel * height * wide, np.empty(2 * _PATCH + 4 * _LINE, np.float32)
-        rows, added = area[2 * _PATCH :], 0.0
+        rows, bits, added = area[2 * _PATCH :], area.view(np.uint32), 0.0
         for left in range(0, wide, _CHUNK):
             counts = tiles[strip, left // TILE : (left + _CHUNK) // TILE]
-            some = counts.any()
+            some, zero = counts.any(), splat(_ZERO)
             if some:
                 _take(x, y, tiles, start, strip, left, height, wide, area, 0)
                 _take(y, y, tiles, start, strip, left, height, wide, area, _PATCH)
+                some = not _blank(bits, 0, 2 * _PATCH)
             for r in range(min(TILE, height - strip * TILE)):
                 for c in range(0, _LINE if some else 0, LANES):
                     mx, my, squares, product = _four_blurs(area, (r + RADIUS) * _LINE + c)
@@ -129,11 +140,14 @@ def compare(x, y, tiles, width, ssim, derivatives, sums):
                 sum_of_row, first = splat(_ZERO), start + (strip * TILE + r) * wide + left
                 for c in range(0, min(_CHUNK, wide - left), LANES):
                     value = by_mean = by_variance = by_covariance = splat(_ZERO)
-                    if counts[c // TILE]:
+                    inside = load(_COLUMNS, 0) + _F(left + c) < _F(width)
+                    if counts[c // TILE] and not some:
+                        value, by_mean, by_variance, by_covariance = _quality(zero, zero, zero, zero, inside)
+                    elif counts[c // TILE]:
                         value, by_mean, by_variance, by_covariance = _quality(
                             _blur(rows, c + _MARGIN), _blur(rows, _LINE + c + _MARGIN),
                             _blur(rows, 2 * _LINE + c + _MARGIN), _blur(rows, 3 * _LINE + c + _MARGIN),
-                            load(_COLUMNS, 0) + _F(left + c) < _F(width),
+                            inside,
                         )  # fmt: skip
                     sum_of_row = sum_of_row + value
                     if ssim.size > 0:
@@ -153,15 +167,22 @@ def gradient(x, y, tiles, derivatives, scale, l1_scale, out, sums):
     `tiles` as in `compare`: nothing is added, and the gradient is zero, where they are false.
     """
     channels, height, wide = x.shape
-    strips = sums.shape[1]
+    strips, bits_x, bits_y = sums.shape[1], x.view(np.uint32).ravel(), y.view(np.uint32).ravel()
     for job in prange(strips * channels):
         channel, strip = job // strips, job % strips
         start, area = channel * height * wide, np.empty(3 * _PATCH + 3 * _LINE, np.float32)
-        rows, added = area[3 * _PATCH :], 0.0
+        rows, bits, added = area[3 * _PATCH :], area.view(np.uint32), 0.0
         for left in range(0, wide, _CHUNK):
             counts = tiles[strip, left // TILE : (left + _CHUNK) // TILE]
             some = counts.any()
-            for k in range(3 if some else 0):
+            if some:  # where both images are zero all around, so is the derivative by the mean
+                _take(derivatives, derivatives, tiles, start, strip, left, height, wide, area, 0)
+                some = not _blank(bits, 0, _PATCH)
+                for row in range(strip * TILE, min(strip * TILE + TILE, height)):
+                    first = start + row * wide + left
+                    end = first + min(_CHUNK, wide - left)
+                    some = some or not (_blank(bits_x, first, end) and _blank(bits_y, first, end))
+            for k in range(1, 3 if some else 0):
                 of = k * x.size + start
                 _take(derivatives, derivatives, tiles, of, strip, left, height, wide, area, k * _PATCH)
             for r in range(min(TILE, height - strip * TILE)):
@@ -172,7 +193,7 @@ def gradient(x, y, tiles, derivatives, scale, l1_scale, out, sums):
                 error, first = splat(_ZERO), start + (strip * TILE + r) * wide + left
                 for c in range(0, min(_CHUNK, wide - left), LANES):
                     slope = splat(_ZERO)
-                    if counts[c // TILE]:
+                    if some and counts[c // TILE]:
                         a, b, at = load(x, first + c), load(y, first + c), c + _MARGIN
                         by_ssim = _blur(rows, at) + b * _blur(rows, 2 * _LINE + at)
                         by_ssim = by_ssim + a * _blur(rows, _LINE + at) * _TWO

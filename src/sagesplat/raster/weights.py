@@ -111,25 +111,35 @@ def most(records, starts, ids, row_order, width, height, columns_of, num_columns
     tiles_x, planes = (width + TILE - 1) // TILE, 7 * PIXELS
     for r in prange(len(row_order)):
         state, (batch, rows) = scratch(6 + num_columns), new_batch()
+        present, found = np.zeros(num_columns, np.bool_), np.empty(num_columns, np.int64)
         for column in range(tiles_x):
             tile, row0, column0 = row_order[r] * tiles_x + column, row_order[r] * TILE, column * TILE
             x0, y0 = _F(column0), _F(row0)
             state[:PIXELS] = _ONE
-            state[planes:] = _ZERO
+            state[planes : planes + PIXELS] = _ZERO
+            present[:] = False
             end = starts[tile]
             while end < starts[tile + 1] and transparent(state):
                 first, end = end, min(end + BATCH, starts[tile + 1])
                 gather_batch(records, ids, first, end, x0, y0, batch, rows)
                 for j in range(end - first):
-                    plane = planes + columns_of[ids[first + j]] * PIXELS
+                    of = columns_of[ids[first + j]]
+                    plane = planes + of * PIXELS
+                    if of and not present[of]:
+                        present[of] = True
+                        state[plane : plane + PIXELS] = _ZERO
                     _cover(state, plane, batch, rows, j, x0, y0)
+            count = 0
+            for of in range(1, num_columns):  # the others have no part in this tile
+                found[count] = of
+                count += present[of]
             for p in range(PIXELS):
                 state[planes + p] += state[p]
             for y in range(row0, min(row0 + TILE, height)):
                 for x in range(column0, min(column0 + TILE, width)):
                     at = planes + _pixel(y - row0, x - column0)
                     best = 0
-                    for of in range(1, num_columns):
-                        if state[at + of * PIXELS] > state[at + best * PIXELS]:
-                            best = of
+                    for k in range(count):
+                        if state[at + found[k] * PIXELS] > state[at + best * PIXELS]:
+                            best = found[k]
                     out[y, x] = best

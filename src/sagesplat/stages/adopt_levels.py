@@ -20,7 +20,7 @@ from sagesplat.formats.levels import write_set
 from sagesplat.formats.stream_header import AS_GIVEN, Precision, rounded
 from sagesplat.formats.stream_increments import write_streams
 from sagesplat.metrics.image import ssim_map
-from sagesplat.raster import device_of
+from sagesplat.raster import Workspace, device_of
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
@@ -193,7 +193,8 @@ def _write(
     """
     run, levels = job.run, len(next(iter(ladder.sizes.values())))
     run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
-    targets = [(row, _image(job, before, row)) for row in spread(job.scene.train_ids.tolist(), _COMPARE)]
+    rows, space = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace()
+    targets = [(row, _image(job, before, row, space)) for row in rows]
     made = write_streams(
         run.increments, ladder.gaussians, ladder.sizes, job.names(), label_of=label_of,
         replaces=ladder.replaces, last=None if lossless else _precision(job, before, targets),
@@ -232,16 +233,20 @@ def _precision(job: Job, g: Gaussians, targets: Sequence[tuple[int, np.ndarray]]
 
 def _kept(job: Job, top: Gaussians, targets: Sequence[tuple[int, np.ndarray]]) -> tuple[float, float]:
     """Mean SSIM and PSNR in dB of the last level to images of what came in, by view; infinite if the same."""
-    images = [(_image(job, top, row), image) for row, image in targets]
+    space = Workspace()
+    images = [(_image(job, top, row, space), image) for row, image in targets]
     error = float(np.mean([np.square(one - other).mean() for one, other in images]))
     ssim = float(np.mean([ssim_map(one, other).mean() for one, other in images]))
     return ssim, -10 * float(np.log10(error)) if error else float("inf")
 
 
 def _ssim(job: Job, targets: Photos, g: Gaussians, rows: Sequence[int]) -> float:
-    return float(np.mean([ssim_map(_image(job, g, row), as_unit(targets[row])).mean() for row in rows]))
+    space = Workspace()
+    return float(
+        np.mean([ssim_map(_image(job, g, row, space), as_unit(targets[row])).mean() for row in rows])
+    )
 
 
-def _image(job: Job, g: Gaussians, row: int) -> np.ndarray:
+def _image(job: Job, g: Gaussians, row: int, space: Workspace) -> np.ndarray:
     camera = job.scene.views[row].camera
-    return render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased)
+    return render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased, workspace=space)

@@ -9,6 +9,7 @@ from sagesplat.adapt.cell_models import FidelityModel, expect
 from sagesplat.adapt.fidelity import measure_compositions, pooled_cells, shown_enough
 from sagesplat.adapt.fidelity_models import (
     NOMINAL,
+    NOTHING_HELD,
     Trial,
     calibrated,
     fit_fidelity,
@@ -28,7 +29,7 @@ from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.results import increments_of, sampled_of, viewpoints_of
 
-_ROUNDS = 2  # after one, categories whose neighbours moved much would seem to be beyond help
+_ROUNDS = 2  # after one, categories whose neighbours moved much would seem to be beyond help; one has none
 
 
 def fit_drawn(job: Job, config: FitConfig) -> dict[int, FidelityModel]:
@@ -50,9 +51,12 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, FidelityModel]:
         capture_cameras(job.scene),
     )
     models.pop(UNLABELLED, None)  # has no target and stays in full
-    for _ in range(_ROUNDS):
+    held = NOTHING_HELD
+    alone = len(np.unique(job.cells.labels)) == 1
+    for _ in range(1 if alone else _ROUNDS):
         models = remove_composition_bias(models, trial(models, bias), confidence)
-    models, held = hold_all_categories(models, trial(models, bias), confidence)
+    if not alone:
+        models, held = hold_all_categories(models, trial(models, bias), confidence)
     for _ in range(_ROUNDS):  # what calibration moved moves the neighbours
         models = calibrated(models, trial(models, calibration), confidence, held)
     return models

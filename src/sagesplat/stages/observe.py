@@ -14,7 +14,10 @@ from sagesplat.run.remote import work_all
 from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_of
+from sagesplat.stages.results import has_photos
 from sagesplat.stages.shared import label_image_inputs
+
+_OBSERVED = 3  # of so many training views of a splat without photos one is measured at all levels
 
 
 def observe_levels(job: Job, config: FitConfig) -> None:
@@ -29,9 +32,11 @@ def observe_levels(job: Job, config: FitConfig) -> None:
         job.emit(tables.ladder_table(seen, job.ladder.counts, job.ladder.recovering, names).event)
         exposed = any(view.camera.exposure is not None for view in job.scene.views)
         how = ", rendered with the exposure of their photos" if exposed else ""
+        fewer = len(_last_only(job))
+        alone = f", in {fewer} of them of the last level alone" if fewer else ""
         return [
             f"{len(table):,} observations of {len(job.ladder.levels)} levels in "
-            f"{len(job.scene.views)} views{how}"
+            f"{len(job.scene.views)} views{how}{alone}"
         ]
 
     levels = method_of(job).level_files[:2]
@@ -47,6 +52,18 @@ def observed_views(job: Job, config: FitConfig, labels: Collection[int] | None =
     return merge(work_all(job, "observe", _observe_views, parts))
 
 
+def _last_only(job: Job) -> set[int]:
+    """Views in which the last level alone is measured: most of a splat without photos.
+
+    Its views are renders, beside which drawn viewpoints say what each level is worth; these are for the
+    report, and to know what each view shows.
+    """
+    if has_photos(job.run):
+        return set()
+    train = job.scene.train_ids.tolist()
+    return set(train) - set(train[1::_OBSERVED])  # not those alone that levels are fitted to (`spread`)
+
+
 def _observe_views(
     job: Job, part: tuple[Sequence[int], dict[int, np.ndarray], Collection[int] | None]
 ) -> Observations:
@@ -54,6 +71,7 @@ def _observe_views(
     rows, far, labels = part
     return observe(
         job.scene, job.photos, job.level_masks, job.ladder, far,
-        views=rows, valid=job.valid, labels=labels, backend=job.backend, antialiased=job.antialiased,
+        views=rows, valid=job.valid, labels=labels, last_only=_last_only(job),
+        backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("observe", done, total)),
     )  # fmt: skip

@@ -83,7 +83,8 @@ def fit_to_renders(
         rgb = rasterize(
             replace(g, **values), cameras[row], backend=backend, antialiased=antialiased, workspace=workspace
         ).rgb
-        grads = torch.autograd.grad(photometric_loss(rgb, images[row]), list(values.values()))
+        loss = photometric_loss(rgb, images[row], workspace=workspace)
+        grads = torch.autograd.grad(loss, list(values.values()))
         falling = rate * (1 + np.cos(np.pi * (step + 1) / steps)) / 2
         for (name, value), grad in zip(values.items(), grads, strict=True):
             first[name].lerp_(grad, 1 - _BETAS[0])
