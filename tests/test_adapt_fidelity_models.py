@@ -162,6 +162,28 @@ def test_the_full_model_keeps_everything_and_promises_rise():
     assert (model.status, model.quality, model.num_views) == ("calibrated", "fidelity", 80)
 
 
+def test_viewpoints_off_the_path_that_need_more_get_more():
+    models, _ = made(0)
+    away = np.repeat([0.0, 0.6], 20)
+    bound = np.broadcast_to(NOMINAL[None, :, None], (40, len(NOMINAL), 1)).copy()
+    fidelity = bound - np.where(away > 0, 0.04, 0)[:, None, None]  # what is promised is missed there
+    ones = np.ones((40, 1))
+    found = Trial(
+        [3], ones > 0, ones, away, bound, np.full((40, len(NOMINAL) - 1, 1), 100), fidelity.astype(np.float32)
+    )
+    (model,), before = remove_composition_bias({3: models[3]}, found, 0.95).values(), models[3].calibration
+    for target in (0.7, 0.8, 0.9):
+        asked = [model.calibration.needed(target, np.array([place]))[0] for place in (0.0, 0.6)]
+        needs = [before.needed(target, away[:1])[0], before.needed(target + 0.04, away[-1:])[0]]
+        np.testing.assert_allclose(asked, needs, atol=0.01)
+    few = Trial(*[part[15:] if isinstance(part, np.ndarray) else part for part in vars(found).values()])
+    (model,) = remove_composition_bias({3: models[3]}, few, 0.95).values()
+    at_photo, same = (
+        one.needed(0.8 + more, away[:1])[0] for one, more in ((model.calibration, 0), (before, 0.04))
+    )
+    assert at_photo == pytest.approx(same, abs=0.01)  # too few on the path to tell
+
+
 def test_a_category_without_a_model_takes_no_promise_from_the_others():
     models, _ = made(0)
     cameras = viewpoints(20, 4)

@@ -54,6 +54,8 @@ _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more 
 # distribution is often a little sparser where they lie far apart: on the built-in capture 8 % of decisions of
 # those walking and 14 % of those stepping back had no promise with 1, 2 % and 6 % have none with this.
 _SPARSER = 0.7
+_NEAR = 0.3  # `Expected.away` of viewpoints that count as on the capture's path
+_FEW = 10  # viewpoints on it, and off it, from which on both are looked at
 
 
 def fit_fidelity(
@@ -237,7 +239,8 @@ def trial_of(
     composed = [expected.of_composition(planned[:, j]) for j in range(len(NOMINAL))]
     bound = np.stack([promised(models, expected, mean) for mean in composed], 1)
     steps = np.diff(planned, axis=1) @ expected.member
-    return Trial(expected.labels.tolist(), shown, expected.support, bound, np.maximum(steps, 0), fidelity)
+    steps = np.maximum(steps, 0)
+    return Trial(expected.labels.tolist(), shown, expected.support, expected.away, bound, steps, fidelity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,6 +250,7 @@ class Trial:
     labels: Sequence[int]  # of the columns, ascending
     shown: Bool[np.ndarray, "V L"]  # whether a viewpoint shows enough of a category to count
     support: Float[np.ndarray, "V L"]  # of the viewpoints; NaN without a model
+    away: Float[np.ndarray, " V"]  # 0 at a photo, 1 far from all
     bound: Float[np.ndarray, "V J L"]  # what is promised of the compositions; NaN: nothing
     steps: Int[np.ndarray, "V J-1 L"]  # by how many levels of its cells each composition is above the last
     fidelity: Float32[np.ndarray, "V J L"]  # what they measure
@@ -278,14 +282,39 @@ def remove_composition_bias(
 ) -> dict[int, FidelityModel]:
     """The models with thresholds that allow for the neighbours' levels; `trial` was planned with the models.
 
+    On the capture's path and off it they are found apart, where enough viewpoints of both show the category:
+    one threshold for all would keep more than is asked on the path, and less among the cameras.
     This is no calibration: it brings what is calibrated close to what is asked.
     """
-    return {
-        label: _asked(model, _empirical(trial.critical(label), confidence))
-        if len(trial.views(label))
-        else model
-        for label, model in models.items()
-    }
+    found = dict(models)
+    for label, model in models.items():
+        critical, away = trial.critical(label), trial.away[trial.views(label)]
+        sides = [away < _NEAR, away >= _NEAR]
+        if min(side.sum() for side in sides) >= _FEW:
+            found[label] = _by_place(model, critical, away, sides, confidence)
+        elif len(away):
+            found[label] = _asked(model, _empirical(critical, confidence))
+    return found
+
+
+def _by_place(
+    model: FidelityModel,
+    critical: Float[np.ndarray, "G n"],
+    away: Float[np.ndarray, " n"],
+    sides: Sequence[Bool[np.ndarray, " n"]],
+    confidence: float,
+) -> FidelityModel:
+    """The model with thresholds that go linearly from what some viewpoints need to what the others do."""
+    needs, places = [], [float(away[side].mean()) for side in sides]
+    for side, place in zip(sides, places, strict=True):
+        thresholds, slopes = _needs(model, _empirical(critical[:, side], confidence))
+        needs.append(np.minimum(thresholds + slopes * place, 1))
+    slopes = (needs[1] - needs[0]) / (places[1] - places[0])
+    now = model.calibration
+    calibration = _calibration(
+        needs[0] - slopes * places[0], slopes, now.status, confidence, now.num_views, now.least_support
+    )
+    return replace(model, calibration=calibration)
 
 
 def hold_all_categories(
@@ -364,11 +393,18 @@ def calibrated(
 def _asked(model: FidelityModel, nominal: Float[np.ndarray, " G"]) -> FidelityModel:
     """The model with the thresholds at which its present bound is `nominal`, the ones to ask for TARGETS."""
     now = model.calibration
-    low = nominal - (now.targets[0] - now.thresholds[0])  # below the first target, as `Calibration.bound`
-    known = np.interp(nominal, now.targets, now.thresholds)
-    thresholds = np.where(nominal < now.targets[0], low, known)
-    slopes = np.interp(nominal, now.targets, now.slopes)
+    thresholds, slopes = _needs(model, nominal)
     calibration = _calibration(
         thresholds, slopes, now.status, now.confidence, now.num_views, now.least_support
     )
     return replace(model, calibration=calibration)
+
+
+def _needs(
+    model: FidelityModel, nominal: Float[np.ndarray, " G"]
+) -> tuple[Float[np.ndarray, " G"], Float[np.ndarray, " G"]]:
+    """Thresholds and slopes at which the model's bound is `nominal`."""
+    now = model.calibration
+    low = nominal - (now.targets[0] - now.thresholds[0])  # below the first target, as `Calibration.bound`
+    known = np.interp(nominal, now.targets, now.thresholds)
+    return np.where(nominal < now.targets[0], low, known), np.interp(nominal, now.targets, now.slopes)
