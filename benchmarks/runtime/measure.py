@@ -10,6 +10,7 @@ from sagesplat.adapt.fidelity import PROMISED_SHARE
 from sagesplat.metrics.image import means_by_label, ssim_map
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
+from sagesplat.segment.masks import UNLABELLED
 
 COUNTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4)  # of the full model's splats, at which methods meet
 SIZES = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)  # of our bytes of the full model: others take several times as many
@@ -103,7 +104,7 @@ def walk(methods: Sequence[Method], job: Job, cameras: Sequence[Camera]) -> list
     references = job.references
     ids, labels = job.cells.ids, job.cells.labels
     tables = [np.zeros((3, len(cameras), len(method.settings))) for method in methods]
-    names = np.unique(labels)
+    names = np.setdiff1d(labels, [UNLABELLED])  # which has no promise
     of_categories = [np.full((*table.shape[1:], len(names)), np.nan) for table in tables]
     fetched = [np.zeros((len(method.settings), len(method.piece_bytes)), bool) for method in methods]
     for frame, camera in enumerate(cameras):

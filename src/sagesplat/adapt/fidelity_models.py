@@ -310,11 +310,7 @@ def _by_place(
         thresholds, slopes = _needs(model, _empirical(critical[:, side], confidence))
         needs.append(np.minimum(thresholds + slopes * place, 1))
     slopes = (needs[1] - needs[0]) / (places[1] - places[0])
-    now = model.calibration
-    calibration = _calibration(
-        needs[0] - slopes * places[0], slopes, now.status, confidence, now.num_views, now.least_support
-    )
-    return replace(model, calibration=calibration)
+    return _with_needs(model, needs[0] - slopes * places[0], slopes)
 
 
 def hold_all_categories(
@@ -392,8 +388,13 @@ def calibrated(
 
 def _asked(model: FidelityModel, nominal: Float[np.ndarray, " G"]) -> FidelityModel:
     """The model with the thresholds at which its present bound is `nominal`, the ones to ask for TARGETS."""
+    return _with_needs(model, *_needs(model, nominal))
+
+
+def _with_needs(
+    model: FidelityModel, thresholds: Float[np.ndarray, " G"], slopes: Float[np.ndarray, " G"]
+) -> FidelityModel:
     now = model.calibration
-    thresholds, slopes = _needs(model, nominal)
     calibration = _calibration(
         thresholds, slopes, now.status, now.confidence, now.num_views, now.least_support
     )
