@@ -51,8 +51,8 @@ def main(
 ) -> None:
     """All checks that a machine with a GPU owes, in so many minutes; `--device cpu` tries the script.
 
-    `runs`: the trainings of `race`, of ours, gsplat, mcmc (gsplat's, as many Gaussians as ours), large
-    (ours, four millions); none: all of them.
+    `runs`: the trainings of `race`, of ours, gsplat, mcmc (gsplat's, as many Gaussians as ours),
+    ours-mcmc (our own), large (ours, four millions); none: all of them.
     """
     asked = Asked(scene, downscale, steps, minutes, device, only, runs, masks, lpips, out, write)
     raise SystemExit(check(asked))
