@@ -28,6 +28,7 @@ from sagesplat.formats.spz import SH_BITS, encode_spz, position_step, read_spz
 from sagesplat.formats.stream import Decoded, decode_stream, palette_of, starts_of_streams
 from sagesplat.io.files import atomic_folder, write_json
 from sagesplat.io.typed import read_json_as
+from sagesplat.kernels.threads import side_by_side
 
 FileFormat = Literal["spz", "ply"]  # of a file that is one increment
 Format = Literal["stream", "spz", "ply"]
@@ -201,11 +202,17 @@ def streams_of(folder: Path, some: Sequence[Increment]) -> Iterator[tuple[Decode
     starts = starts_of_streams(content, name=str(path))
     palette = palette_of(content, name=str(path))
     places = np.searchsorted(starts, [one.offset for one in some], "right") - 1
-    for place, own in groupby(zip(places.tolist(), some, strict=True), key=itemgetter(0)):
-        listed, start = [one for _, one in own], starts[place]
+    groups = groupby(zip(places.tolist(), some, strict=True), key=itemgetter(0))
+    streams = [(starts[place], [one for _, one in own]) for place, own in groups]
+
+    def decoded_of(stream: tuple[int, list[Increment]]) -> Decoded:
+        start, listed = stream
         end = max(one.offset + one.nbytes for one in listed)
-        decoded = decode_stream(content[start:end], palette=palette, label_id=listed[0].cell, name=str(path))
-        yield replace(decoded, start=start, ends=tuple(start + at for at in decoded.ends)), listed
+        found = decode_stream(content[start:end], palette=palette, label_id=listed[0].cell, name=str(path))
+        return replace(found, start=start, ends=tuple(start + at for at in found.ends))
+
+    for decoded, (_, listed) in zip(side_by_side(decoded_of, streams), streams, strict=True):
+        yield decoded, listed
 
 
 def _rows(folder: Path, decoded: Decoded, one: Increment) -> slice:

@@ -7,7 +7,8 @@ first levels of all cells come before what replaces them, so that a viewer gets 
 import hashlib
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -33,6 +34,7 @@ from sagesplat.formats.stream import Encoded, encode_stream
 from sagesplat.formats.stream_header import Grid, Precision, harmonics_of, position_steps, turned_round
 from sagesplat.formats.stream_palette import Palette
 from sagesplat.io.files import atomic_folder
+from sagesplat.kernels.threads import side_by_side
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,21 +98,17 @@ def write_streams(
             finest = [one for one, is_last in sets if is_last and not far[one]]
             palette = _palette(g, finest, last) if last and replaces else None
             content = palette.encoded() if palette else b""
-            for one, is_last in sets:
-                part, precision = _of(g, one), last if is_last else Precision()
-                if precision is None or far[one]:
-                    mine.append(_in_files(fresh, part, one, label, stem, antialiased))
-                    continue
-                part = _with_one_seen(part, one.sizes[0], precision) if replaces else part
-                own = second and SecondOpacities(
-                    second.logits[one.rows], {one.cell: second.weights[one.cell]}
-                )
-                coded = encode_stream(
-                    part, one.sizes, second=own, antialiased=antialiased, name=stem,
-                    palette=palette if is_last else None,
-                    precision=replace(precision, grid=(grids or {}).get(one.cell)),
-                )  # fmt: skip
-                if len(coded.rows):
+            encode = partial(
+                _encoded, g=g, last=last, replaces=bool(replaces), second=second, grids=grids or {},
+                palette=palette, antialiased=antialiased, name=stem,
+            )  # fmt: skip
+            streams = [(one, is_last) for one, is_last in sets if not far[one] and (last or not is_last)]
+            coded_of = dict(zip((one for one, _ in streams), side_by_side(encode, streams), strict=True))
+            for one, _ in sets:
+                coded = coded_of.get(one)
+                if coded is None:
+                    mine.append(_in_files(fresh, _of(g, one), one, label, stem, antialiased))
+                elif len(coded.rows):
                     ranges = _ranges(label, one, f"{stem}{STREAM}", len(content), coded, bits)
                     mine.append(replace(one, rows=one.rows[coded.rows], sizes=coded.sizes, increments=ranges))
                     content += coded.content
@@ -128,8 +126,35 @@ def write_streams(
     return Streams(written, left, np.concatenate([np.arange(0), *(one.rows for one in made)]))
 
 
+def _encoded(
+    of: tuple[_Set, bool],
+    *,
+    g: Gaussians,
+    last: Precision | None,
+    replaces: bool,
+    second: SecondOpacities | None,
+    grids: Mapping[int, Grid],
+    palette: Palette | None,
+    antialiased: bool,
+    name: str,
+) -> Encoded:
+    """A set, which may be its cell's last, as a stream."""
+    one, is_last = of
+    precision = last if is_last and last else Precision()
+    part = _with_one_seen(_of(g, one), one.sizes[0], precision) if replaces else _of(g, one)
+    own = second and SecondOpacities(second.logits[one.rows], {one.cell: second.weights[one.cell]})
+    return encode_stream(
+        part, one.sizes, second=own, antialiased=antialiased, name=name,
+        palette=palette if is_last else None, precision=replace(precision, grid=grids.get(one.cell)),
+    )  # fmt: skip
+
+
 def _of(g: Gaussians, one: _Set) -> Gaussians:
-    return g.select(torch.from_numpy(one.rows))
+    """The Gaussians of a set; without a copy where they follow each other, as they do in a ladder."""
+    rows = one.rows
+    if len(rows) and rows[-1] - rows[0] + 1 == len(rows):
+        return Gaussians(**{f.name: getattr(g, f.name)[rows[0] : rows[-1] + 1] for f in fields(g)})
+    return g.select(torch.from_numpy(rows))
 
 
 def _palette(g: Gaussians, sets: Sequence[_Set], precision: Precision) -> Palette | None:

@@ -22,6 +22,7 @@ from sagesplat.core.sh import sh0_to_rgb
 from sagesplat.formats.labels import sidecar
 from sagesplat.formats.levels import read_header, read_level, read_more, write_level, write_set
 from sagesplat.formats.offsets import beside as offset_beside
+from sagesplat.formats.sog_write import sog_order
 from sagesplat.formats.splat import relative_to
 from sagesplat.formats.splats import Splat, num_lods, read_splat
 from sagesplat.io.typed import check_limits
@@ -129,6 +130,9 @@ def _make_capture(
         foretell_adopt(job, len(splat.gaussians), config.steps if config.fit == "renders" else 0)
         if labelled:
             splat = _labelled(splat)
+        # files of levels hold one category after the other; neighbours in space are rendered together
+        order = torch.from_numpy(sog_order(splat.gaussians))
+        splat = replace(splat, gaussians=splat.gaussians.select(order))
         left_out = "".join(f", {count:,} left out ({reason})" for reason, count in splat.dropped.items())
         g = splat.gaussians
         if photos and config.cameras:
@@ -183,8 +187,7 @@ def _labelled(splat: Splat) -> Splat:
     if not found:
         return replace(splat, gaussians=replace(g, label_ids=torch.zeros_like(g.label_ids)), names=_WHOLE)
     names = {label: splat.names.get(label, f"category {label}") for label in found}
-    # files of levels hold one category after the other
-    return replace(splat, gaussians=g.select(torch.argsort(g.label_ids, stable=True)), names=names)
+    return replace(splat, names=names)
 
 
 def _cameras(
