@@ -2,6 +2,7 @@
 
 import base64
 import http.server
+import io
 import json
 import re
 import shutil
@@ -19,6 +20,7 @@ import torch
 from browser import Opened, open_page
 from make_viewer_vectors import SCREENS, calibration, model
 from page_checks import wrong_with, wrong_with_keyboard
+from PIL import Image
 
 from sagesplat.adapt.cell_models import CellModel, FidelityModel
 from sagesplat.adapt.cells import describe_cells
@@ -139,8 +141,15 @@ def three_walls(folder: Path, label_of: Mapping[int, int] = LABEL_OF, **incremen
     entries = [CameraEntry(f"photo{k}.jpg", "train", camera(0.2 * k)) for k in range(3)]
     return Contents(
         "three walls", 1.0, entries, categories, describe_cells(g, dict(label_of)), chunks,
-        folder / "chunks", 3, meters_per_unit=1.0,
+        folder / "chunks", 3, meters_per_unit=1.0, looks=((0.8, 0.95, 1.0), strip()),
     )  # fmt: skip
+
+
+def strip() -> bytes:
+    """What three fidelities look like."""
+    file = io.BytesIO()
+    Image.new("RGB", (60, 15)).save(file, "JPEG")
+    return file.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -460,8 +469,13 @@ def test_the_keyboard_is_enough(site: str, browser: Any) -> None:
         page.keyboard.press("p")
         slider = page.get_by_role("slider", name="Keep quality at")
         slider.focus()
+        assert not page.is_visible(".looks")
         page.keyboard.press("ArrowRight")
         assert page.evaluate("sagesplat.settings().target") == pytest.approx(0.96)
+        page.wait_for_selector(".looks")
+        assert page.inner_text(".looks").split() == ["0.95", "full"]
+        places = "[...document.querySelectorAll('.looks i')].map((i) => i.style.backgroundPositionX)"
+        assert page.evaluate(places) == ["50%", "100%"]
         page.get_by_role("radio", name="Quality").press("ArrowRight")
         assert page.evaluate("sagesplat.settings().mode") == "budget"
         page.get_by_role("button", name="Hide brick").press("Enter")

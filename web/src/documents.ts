@@ -49,6 +49,12 @@ export interface Manifest {
     gpuBytes: Whole;
   };
   ladder?: Sha256;
+  /** What fidelities look like: a picture with the same part of a view for each, side by side, equally wide; 1 is the full scene. */
+  looks?: {
+    uri: "looks.jpg";
+    /** Ascending. */
+    targets: number[];
+  };
   labels: Label[];
   /** Viewpoint models by quality: against the full model (fidelity), against photos (ssim). */
   promises: {

@@ -28,12 +28,18 @@ export function sourceInside(page: ParentNode): Source | null {
   };
 }
 
-/** A file of a source as a whole, which the page has inside. */
+/** A file of a source as a whole. */
 export async function bytesFrom(source: Source, uri: string): Promise<ArrayBuffer> {
   const reply = await source.fetch(new URL(uri, source.base).href);
-  const { value } = (await reply.body?.getReader().read()) ?? {};
-  if (!value) throw new Error(`${uri} is not in this page; write it again.`);
-  return new Uint8Array(value).buffer;
+  const reader = reply.ok ? reply.body?.getReader() : undefined;
+  const parts: Uint8Array[] = [];
+  for (;;) {
+    const { value } = (await reader?.read()) ?? {};
+    if (!value) break;
+    parts.push(value);
+  }
+  if (!parts.length) throw new Error(`${uri} is missing; write the bundle again.`);
+  return new Blob(parts as BlobPart[]).arrayBuffer();
 }
 
 const MISSING: Reply = {

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from PIL import Image
 
 from sagesplat.adapt.observe import large_enough
@@ -26,6 +27,7 @@ from sagesplat.segment.display_names import meant
 from sagesplat.stages.bundle_contents import bundle_contents
 from sagesplat.stages.edited import label_settings
 from sagesplat.stages.export import increment_files
+from sagesplat.stages.looks import looks
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import (
     fidelity_of,
@@ -45,6 +47,7 @@ from sagesplat.viewer.promises import Seen
 from sagesplat.viewer.single_file import check_page, write_single_file
 
 _POSTER_HEIGHT = 360  # px
+_LOOKS = 2.0  # pixels a side, of the photos', of what fidelities look like
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,7 @@ def bundle(
         target=main_target(job.run) if job.run.plan.exists() else None,
         ladder=ladder_hash(listed, job.names()),
         hidden=edited.hidden,
+        looks=_looks(job),
     )
     contents = replace(contents, categories=_with_quality(job, contents.categories, always, weights))
     contents = with_corrections(contents)
@@ -157,9 +161,20 @@ def _poster(g: Gaussians, contents: Contents) -> bytes:
     camera = camera_at(first["position"], first["quaternion"], FOV_Y, width, _POSTER_HEIGHT)
     with torch.no_grad():
         image = rasterize(g, camera, backend="cpu", antialiased=contents.antialiased).rgb
-    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return _jpeg((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy(), 72)
+
+
+def _looks(job: Job) -> tuple[Sequence[float], bytes] | None:
+    """The fidelities of the run's plans and 1, and a JPEG of a part of a view at each, side by side."""
+    shown = looks(job, _LOOKS)
+    if not shown:
+        return None
+    return [look.asked for look in shown], _jpeg(np.concatenate([look.image for look in shown], axis=1), 85)
+
+
+def _jpeg(pixels: UInt8[np.ndarray, "H W 3"], quality: int) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "JPEG", quality=72, optimize=True)
+    Image.fromarray(pixels).save(file, "JPEG", quality=quality, optimize=True)
     return file.getvalue()
 
 

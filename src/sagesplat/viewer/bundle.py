@@ -18,7 +18,7 @@ from sagesplat.formats.stream import end_of_palette
 from sagesplat.io.files import atomic_folder, unwritable, write_text
 from sagesplat.io.typed import known_json
 from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_pack, with_poster
-from sagesplat.viewer.manifest import FORMAT, THIRD_PARTY, Contents, documents, pack_order
+from sagesplat.viewer.manifest import FORMAT, LOOKS, THIRD_PARTY, Contents, documents, pack_order
 from sagesplat.viewer.pack import beginning_of, write_pack
 from sagesplat.viewer.quality import dumped
 
@@ -92,6 +92,8 @@ def write_documents(folder: Path, contents: Contents) -> BundleSizes:
         (folder / manifest["promises"][quality]["uri"]).write_bytes(content)
     write_text(folder / SCHEMA, files("sagesplat.viewer").joinpath(SCHEMA).read_text(encoding="utf-8"))
     write_text(folder / "LICENSES.txt", LICENSES)
+    if contents.looks is not None:
+        (folder / LOOKS).write_bytes(contents.looks[1])
     text = dumped(manifest)
     write_text(folder / MANIFEST, text.decode())
     total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

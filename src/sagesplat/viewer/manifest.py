@@ -36,6 +36,7 @@ from sagesplat.viewer.quality import (
 )
 
 FORMAT, VERSION = "sagesplat-bundle", 1
+LOOKS = "looks.jpg"
 QUALITIES: tuple[QualityKind, ...] = get_args(QualityKind)
 TARGETS: dict[QualityKind, float] = {"fidelity": 0.95, "ssim": 0.7}  # where no plan says one
 THIRD_PARTY = "THIRD_PARTY_LICENSES.txt"  # of the built viewer
@@ -87,6 +88,7 @@ class Contents:
     target: tuple[QualityKind, float] | None = None  # of the run's plan; None: a usual one
     ladder: str | None = None  # `formats.label_edits.ladder_hash`; None: labels cannot be edited
     hidden: Collection[str] = ()  # names of categories that are not shown to begin with
+    looks: tuple[Sequence[float], bytes] | None = None  # fidelities, and a JPEG of them side by side
 
     @property
     def qualities(self) -> list[QualityKind]:
@@ -182,6 +184,7 @@ def documents(
         "pack": None,
         "cameras": [_camera(entry, contents.extent) for entry in contents.cameras],
         "start": {key: significant(value) for key, value in start_of(contents).items()},
+        **({} if contents.looks is None else {"looks": {"uri": LOOKS, "targets": list(contents.looks[0])}}),
         "licenses": _licenses(third_party),
     }
     return manifest, promises

@@ -14,7 +14,7 @@ from sagesplat.core.errors import RunError, SageError
 from sagesplat.io.files import atomic_path, unwritable
 from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_poster
 from sagesplat.viewer.bundle import LICENSES, MANIFEST, BundleSizes, verified_files
-from sagesplat.viewer.manifest import THIRD_PARTY, Contents, documents
+from sagesplat.viewer.manifest import LOOKS, THIRD_PARTY, Contents, documents
 from sagesplat.viewer.quality import dumped
 
 MOST = 256 * 2**20  # bytes of increments: browsers keep the text of the page in memory, a third larger
@@ -51,6 +51,8 @@ def write_single_file(
     named = {manifest["promises"][quality]["uri"]: content for quality, content in promises.items()}
     text = dumped(manifest)
     small = {MANIFEST: text, "LICENSES.txt": LICENSES.encode(), **named}
+    if contents.looks is not None:
+        small[LOOKS] = contents.looks[1]
     if any(chunk.format != "stream" for chunk in contents.chunks):
         small["assets/spark.wasm"] = _decoder(viewer)
     if (viewer / THIRD_PARTY).exists():

@@ -7,6 +7,7 @@ import { DEFAULT_TARGETS, type Viewer } from "../view/viewer";
 import { h, iconButton, setText, textButton } from "./dom";
 import { formatBytes, formatCount, formatLook, formatScreens, formatSsim, nameOf } from "./format";
 import { LabelTable } from "./labels";
+import { Looks } from "./looks";
 import { photosOf } from "./toolbar";
 
 const MODES: readonly (readonly [Settings["mode"], string])[] = [
@@ -222,6 +223,7 @@ function slider(
 
 function targetSlider(viewer: Viewer): Control {
   const look = h("small", { class: "look" });
+  const pictures = viewer.manifest.looks && new Looks(viewer, viewer.manifest.looks);
   const control = slider(
     "Keep quality at",
     ["target"],
@@ -231,11 +233,19 @@ function targetSlider(viewer: Viewer): Control {
     ({ target, quality }) => `${nameOf(quality)} ${formatSsim(target)}`,
   );
   control.element.append(look);
+  if (pictures) {
+    control.element.append(pictures.element);
+    // nothing is fetched before somebody moves the slider
+    for (const event of ["input", "pointerdown"] as const) {
+      control.element.addEventListener(event, () => pictures.show(), { once: true });
+    }
+  }
   return {
     element: control.element,
     update: (settings) => {
       control.update(settings);
       setText(look, formatLook(settings.quality, settings.target));
+      pictures?.update(settings);
     },
   };
 }

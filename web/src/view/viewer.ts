@@ -48,7 +48,7 @@ export class Viewer {
   constructor(
     canvas: HTMLCanvasElement,
     readonly manifest: Manifest,
-    source: Source,
+    readonly source: Source,
     options: Options,
     keys: EventTarget,
   ) {

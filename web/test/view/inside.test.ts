@@ -2,7 +2,7 @@
 
 import { expect, test } from "vitest";
 import { loadManifest } from "../../src/core/manifest";
-import { bytesOf, sourceInside } from "../../src/inside";
+import { bytesFrom, bytesOf, sourceInside } from "../../src/inside";
 import { Network, VirtualClock } from "../simulate";
 import { bundle } from "../worlds";
 
@@ -68,4 +68,18 @@ test("base64 with and without the browser's help", () => {
   native.fromBase64 = (given: string) => new Uint8Array(Buffer.from(given, "base64"));
   expect(bytesOf(text)).toEqual(bytes);
   native.fromBase64 = before;
+});
+
+test("a file that comes in pieces is put together, and a missing one is said", async () => {
+  const pieces = [Uint8Array.of(1, 2), Uint8Array.of(3)];
+  const fetch = async () => ({
+    ok: true,
+    status: 200,
+    headers: { get: () => null },
+    body: { getReader: () => ({ read: async () => ({ value: pieces.shift() }) }) },
+    text: async () => "",
+  });
+  const source = { base: new URL("https://a.test/"), fetch } as unknown as Parameters<typeof bytesFrom>[0];
+  expect([...new Uint8Array(await bytesFrom(source, "looks.jpg"))]).toEqual([1, 2, 3]);
+  await expect(bytesFrom(source, "looks.jpg")).rejects.toThrow("looks.jpg is missing");
 });
