@@ -339,6 +339,21 @@ def manifest_of(folder: Path) -> dict[str, Any]:
     return manifest
 
 
+def test_a_category_with_fewer_files_than_others_has_as_many_levels(tmp_path, contents, viewer) -> None:
+    def levels_of(made: Contents) -> list[int]:
+        write_bundle(tmp_path / "out", made, viewer)
+        (car,) = (one for one in manifest_of(tmp_path / "out")["labels"] if one["name"] == "car")
+        most = max(len(cell["levels"]) for cell in car["cells"])
+        levels = car["quality"]["fidelity"]["levels"]
+        assert levels == list(range(1, most + 1))
+        assert len(car["quality"]["fidelity"]["mean"]) == most
+        return levels
+
+    assert levels_of(contents) == [1, 2, 3]
+    fewer = [one for one in contents.chunks if LABEL_OF[one.cell] != 3 or one.level < 3]
+    assert levels_of(replace(contents, chunks=fewer)) == [1, 2]
+
+
 def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> None:
     out = tmp_path / "out"
     written = write_bundle(out, contents, viewer)

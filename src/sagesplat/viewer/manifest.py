@@ -151,7 +151,8 @@ def documents(
         given = {c.label_id: c.fidelity for c in contents.categories if c.label_id in models and c.fidelity}
         document = fidelity_document(given, contents.levels, contents.last, contents.shown, cost, around)
         promises["fidelity"] = dumped(document)
-        entries["fidelity"] = fidelity_entries(models, contents.shown, contents.drawn, cost.shape[1])
+        counts = {cell: len(levels) for cell, levels in contents.levels.items()}
+        entries["fidelity"] = fidelity_entries(models, contents.shown, contents.drawn, counts)
     if ssim:
         seen = {c.label_id: c.seen for c in contents.categories if c.seen is not None}
         photos = [entry.camera for entry in contents.cameras]

@@ -38,12 +38,16 @@ def of_levels(model: ViewModel, levels: Sequence[int]) -> ViewModel:
 
 
 def fidelity_entries(
-    models: Mapping[int, FidelityModel], cells: Cells, cameras: Sequence[Camera], levels: int
+    models: Mapping[int, FidelityModel], cells: Cells, cameras: Sequence[Camera], counts: Mapping[int, int]
 ) -> dict[int, dict[str, Any]]:
     """By label id `quality_entry` of fidelity: all cells at one level, from the viewpoints that show any.
 
-    `models`: with as many levels as said.
+    `counts`: levels by cell id; `models` have as many as the largest of these, and an entry as many as the
+    largest of its label's cells.
     """
+    levels, own = max(counts.values()), dict[int, int]()
+    for cell, label in cells.label_of.items():
+        own[label] = max(own.get(label, 0), counts[cell])
     expected, found = expect(models, cells, cameras, levels), {}
     composed = [expected.of_composition(np.full(expected.share.shape, k + 1)) for k in range(levels)]
     mean = np.stack(composed, 2)
@@ -53,7 +57,8 @@ def fidelity_entries(
             shown = ~np.isnan(mean[:, column, 0])
             seen = mean[shown, column] if shown.any() else np.zeros((1, levels))
             kept = bound[shown, column] if shown.any() else np.full((1, levels), np.nan)
-            found[label] = _entry(models[label], range(1, levels + 1), seen, kept)
+            last = own[label]
+            found[label] = _entry(models[label], range(1, last + 1), seen[:, :last], kept[:, :last])
     return found
 
 
