@@ -350,7 +350,9 @@ def test_a_category_with_fewer_files_than_others_has_as_many_levels(tmp_path, co
         return levels
 
     assert levels_of(contents) == [1, 2, 3]
-    fewer = [one for one in contents.chunks if LABEL_OF[one.cell] != 3 or one.level < 3]
+    sizes = SIZES | {3: (1, 5, 9)}  # the tree has three files
+    chunks = write_increments(tmp_path / "chunks", G, sizes, NAMES, label_of=LABEL_OF)
+    fewer = [one for one in chunks if LABEL_OF[one.cell] != 3 or one.level < 3]
     assert levels_of(replace(contents, chunks=fewer)) == [1, 2]
 
 
