@@ -375,7 +375,7 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
         for level in cell["levels"]:
             content = (out / level["uri"]).read_bytes()
             assert len(content) == level["bytes"]
-            assert hashlib.sha256(content).hexdigest() == level["sha256"]
+            assert hashlib.sha256(content).hexdigest()[:16] == level["sha256"]
             assert len(read_spz(out / level["uri"])) == level["count"]
             total += len(content)
     assert manifest["totals"]["bytes"] == written.chunks == total
@@ -430,7 +430,7 @@ def packed_parts(out: Path) -> list[list[int]]:
     for cell, level in pack["order"]:
         entry = levels[cell][level - 1]
         part = content[at : at + entry["bytes"]]
-        assert hashlib.sha256(part).hexdigest() == entry["sha256"]
+        assert hashlib.sha256(part).hexdigest()[:16] == entry["sha256"]
         at += len(part)
     assert at == len(content) == pack["bytes"]
     assert pack["sha256"] == hashlib.sha256(content).hexdigest()
@@ -510,7 +510,7 @@ def test_a_palette_is_the_first_range_of_its_file(tmp_path, contents, viewer) ->
         content = (tmp_path / "out" / palette["uri"]).read_bytes()
         assert {one["uri"] for one in levels} == {palette["uri"]}
         assert (palette["offset"], palette["bytes"]) == (0, min(one["offset"] for one in levels))
-        assert hashlib.sha256(content[: palette["bytes"]]).hexdigest() == palette["sha256"]
+        assert hashlib.sha256(content[: palette["bytes"]]).hexdigest()[:16] == palette["sha256"]
         assert palette["bytes"] + sum(one["bytes"] for one in levels) == len(content)
     uri = made.increments[0].uri
     damaged = bytearray((tmp_path / "chunks" / uri).read_bytes())

@@ -78,7 +78,7 @@ def test_everything_is_in_the_page(tmp_path, viewer, contents) -> None:
     assert (files.pop("THIRD_PARTY_LICENSES.txt"), b"Apache" in files.pop("LICENSES.txt")) == (b"MIT", True)
     assert files.pop("assets/spark.wasm") == b"\0asm"  # there are levels in SPZ
     levels = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
-    assert [hashlib.sha256(files[level["uri"]]).hexdigest() for level in levels] == [
+    assert [hashlib.sha256(files[level["uri"]]).hexdigest()[:16] for level in levels] == [
         level["sha256"] for level in levels
     ]
     assert len(files) == len(levels)

@@ -2,7 +2,7 @@
 
 export type Vec3 = [number, number, number];
 export type Whole = number;
-/** A SHA-256 in hexadecimal. */
+/** A SHA-256 in hexadecimal, or its first digits. */
 export type Sha256 = string;
 /** A path below the bundle's folder. */
 export type Path = string;

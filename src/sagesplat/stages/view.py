@@ -192,7 +192,7 @@ class _Chunks:
 
 def _is_current(run: RunDir, folder: Path) -> bool:
     """Whether a bundle has the run's chunks, and promises and a target no older than the run's."""
-    from sagesplat.formats.increments import INDEX
+    from sagesplat.formats.increments import DIGITS, INDEX
 
     if not (folder / MANIFEST).exists():
         return False
@@ -201,7 +201,7 @@ def _is_current(run: RunDir, folder: Path) -> bool:
     if manifest is None or listed is None:  # `bundle` says what is wrong with the run
         return False
     held = {level.sha256 for label in manifest.labels for cell in label.cells for level in cell.levels}
-    chunks = {chunk.sha256 for chunk in listed.chunks}
+    chunks = {chunk.sha256[:DIGITS] for chunk in listed.chunks}
     made = (folder / MANIFEST).stat().st_mtime
     newer = (path for path in (run.fidelity, run.promises, run.plan) if path.exists())
     return held == chunks and all(path.stat().st_mtime <= made for path in newer)

@@ -19,7 +19,7 @@ from sagesplat import __version__
 from sagesplat.adapt.cell_models import FidelityModel
 from sagesplat.adapt.cells import STEPS, Cells
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
-from sagesplat.formats.increments import Increment, full_scene, palettes_of
+from sagesplat.formats.increments import DIGITS, Increment, full_scene, palettes_of
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import frames
 from sagesplat.viewer.frames import FLIP
@@ -262,7 +262,7 @@ def _palettes(contents: Contents) -> dict[int, dict[str, Any]]:
     found = {}
     for uri, nbytes in palettes_of(contents.chunks).items():
         with (contents.folder / uri).open("rb") as file:
-            digest = hashlib.sha256(file.read(nbytes)).hexdigest()
+            digest = hashlib.sha256(file.read(nbytes)).hexdigest()[:DIGITS]
         found[label_of[uri]] = {"uri": f"chunks/{uri}", "offset": 0, "bytes": nbytes, "sha256": digest}
     return found
 
@@ -291,7 +291,7 @@ def _level(chunk: Increment) -> dict[str, Any]:
         "bytes": chunk.nbytes,
         "gpuBytes": chunk.gpu_bytes,
         "count": chunk.count,
-        "sha256": chunk.sha256,
+        "sha256": chunk.sha256[:DIGITS],
     }
 
 

@@ -13,7 +13,7 @@ from msgspec import Meta
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import NO_OFFSET, Position
-from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
+from sagesplat.core.limits import AtLeast1, Count, FirstDigits, LabelId, Share
 from sagesplat.core.names import repaired
 from sagesplat.formats.increments import INDEX, Increment, Refine, read_increments, read_index, shown
 from sagesplat.formats.lod_meta import LOD_META, level_files
@@ -106,7 +106,7 @@ class _BundleLevel:
     count: AtLeast1
     bytes: AtLeast1
     gpuBytes: AtLeast1
-    sha256: Sha256
+    sha256: FirstDigits
     refine: Refine = "ADD"
     offset: Count = 0
     weight: Share | None = None
