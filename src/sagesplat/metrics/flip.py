@@ -75,13 +75,11 @@ def _blurred(plane: np.ndarray, terms: Sequence[tuple[float, float]], pixels_per
     radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * pixels_per_degree)
     squares = (np.arange(-radius, radius + 1) / pixels_per_degree) ** 2
     kernels = [np.exp(-(math.pi**2) / b * squares) for _, b in terms]
-    weights = [
-        a * math.sqrt(math.pi / b) * kernel.sum() ** 2 for (a, b), kernel in zip(terms, kernels, strict=True)
-    ]
-    return sum(
-        np.float32(weight / sum(weights)) * _separable(plane, kernel / kernel.sum(), kernel / kernel.sum())
-        for weight, kernel in zip(weights, kernels, strict=True)
-    )
+    volumes = [a * math.sqrt(math.pi / b) * k.sum() ** 2 for (a, b), k in zip(terms, kernels, strict=True)]
+    out = np.zeros_like(plane)
+    for volume, kernel in zip(volumes, kernels, strict=True):
+        out += np.float32(volume / sum(volumes)) * _separable(plane, *2 * (kernel / kernel.sum(),))
+    return out
 
 
 def _separable(plane: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:
@@ -114,10 +112,7 @@ def _features(grey: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarray, n
     even, found = flat / flat.sum(), []
     for kernel in (-x * flat, (x**2 / sigma**2 - 1) * flat):
         kernel = np.where(kernel > 0, kernel / kernel[kernel > 0].sum(), kernel / -kernel[kernel < 0].sum())
-        across, down = (
-            _separable(grey, flat / flat.sum(), kernel),
-            _separable(grey, kernel, flat / flat.sum()),
-        )
+        across, down = _separable(grey, even, kernel), _separable(grey, kernel, even)
         found.append(np.sqrt(across * across + down * down))
     return found[0], found[1]
 
