@@ -66,7 +66,7 @@ $(CORE): pyproject.toml constraints.txt
 	touch $@
 
 $(INSTALLED): $(CORE)
-	$(INSTALL) '.[dev,docs,onnx,hf,poses,video,heic,view,ray,flip]'
+	$(INSTALL) '.[dev,docs,onnx,hf,poses,video,heic,view,ray]'
 	touch $@
 
 .PHONY: docs gallery

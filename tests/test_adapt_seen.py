@@ -33,6 +33,12 @@ def test_compositions_render_alike(tmp_path, two, antialiased):
     )  # and its lists of tiles
     assert 0 < seen.nbytes == 60 * len(seen.gaussians) < 60 * 300
     assert seen.gaussians.sh_degree == 0 < g.sh_degree
+    some = [{3: 2, 7: 1}, {3: 2, 7: 2}]  # the others are not asked for
+    fewer = seen_from(ladder, camera, compositions=some, **how)
+    assert fewer.nbytes < fast.nbytes
+    for levels in some:
+        np.testing.assert_array_equal(*(one.render(levels).copy() for one in (fewer, fast)))
+        assert (fewer.label_ids(levels) == fast.label_ids(levels)).all()
     for levels in ({3: 1, 7: 1}, {3: 3, 7: 2}, {7: 3, 3: 2}, {3: 3, 7: 3}, {7: 1}):
         expected, actual = (
             rasterize(one.compose(levels), camera, antialiased=antialiased).rgb for one in (ladder, seen)

@@ -1,16 +1,14 @@
-"""FLIP by flip-evaluator: its map, its pixels per degree, and the line where it is missing."""
+"""FLIP: its map is that of flip-evaluator, its pixels per degree count."""
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
-from sagesplat.core.errors import BackendUnavailable
-from sagesplat.metrics import flip
 from sagesplat.metrics.flip import PIXELS_PER_DEGREE, flip_map
 
 
 @pytest.fixture
 def pair() -> tuple[np.ndarray, np.ndarray]:
-    pytest.importorskip("flip_evaluator", reason="needs the extra flip")
     rng = np.random.default_rng(0)
     x = rng.random((40, 60, 3), np.float32)
     return x, (x + 0.2 * rng.standard_normal(x.shape)).clip(0, 1).astype(np.float32)
@@ -32,7 +30,6 @@ def test_a_map_of_the_visible_difference(pair):
 
 
 def test_black_and_white_differ_most():
-    pytest.importorskip("flip_evaluator", reason="needs the extra flip")
     black = np.zeros((16, 16, 3), np.float32)
     assert flip_map(black, black + 1).mean() > 0.9
 
@@ -44,10 +41,15 @@ def test_noise_of_smaller_pixels_is_less_visible(pair):
     assert float(flip_map(x, y).mean()) == default
 
 
-def test_without_the_package_one_line_says_how_to_get_it(monkeypatch):
-    monkeypatch.setattr(flip, "find_spec", lambda name: None)
-    image = np.zeros((8, 8, 3), np.float32)
-    with pytest.raises(
-        BackendUnavailable, match=r"no FLIP: flip-evaluator is not installed; .*sagesplat\[flip\]"
-    ):
-        flip_map(image, image)
+@pytest.mark.parametrize(("shape", "ppd"), [((72, 96), PIXELS_PER_DEGREE), ((90, 40), 33), ((7, 9), 134)])
+def test_the_map_is_that_of_its_authors(shape, ppd):
+    evaluator = pytest.importorskip("flip_evaluator", reason="needs flip-evaluator, of the extra dev")
+    rng = np.random.default_rng(1)
+    x = (2 * gaussian_filter(rng.random((*shape, 3)), (3, 3, 0)) - 0.5).clip(0, 1).astype(np.float32)
+    y = (x + gaussian_filter(rng.standard_normal(x.shape), (1, 1, 0))).clip(0, 1).astype(np.float32)
+    how = {"ppd": float(ppd)}
+    theirs = evaluator.evaluate(x, y, "LDR", applyMagma=False, computeMeanError=False, parameters=how)[0]
+    np.testing.assert_allclose(flip_map(y, x, ppd), theirs[..., 0], atol=1e-5)
+    pure = np.zeros((1, 40, 3), np.float32)
+    pure[:, :20, 1] = pure[:, 20:, 2] = 1  # green, blue: the largest difference of colour
+    assert flip_map(pure[:, :20], pure[:, 20:]).max() == pytest.approx(1, abs=1e-5)

@@ -17,13 +17,12 @@ BACKGROUND = torch.tensor([0.2, 0.3, 0.4])
 
 
 @settings(max_examples=50, derandomize=True)
-@given(st.lists(st.tuples(st.floats(0, 1e30), st.integers(0, 2)), max_size=60))
-def test_depth_order_is_a_stable_sort(rows):
-    depths = np.array([d for d, _ in rows], np.float32).round(1) + np.float32(0.01)  # many ties
-    radii = np.array([r for _, r in rows], np.float32)
-    drawn = np.flatnonzero(radii > 0)
-    expected = drawn[np.argsort(depths[drawn], kind="stable")]
-    np.testing.assert_array_equal(tiles.depth_order(depths, radii), expected)
+@given(st.lists(st.integers(0, 2**32 - 1), max_size=60), st.integers(0, 31), st.integers(1, 4))
+def test_order_in_a_tile_is_a_stable_sort(keys, shift, times):
+    found = np.array(keys * times, np.uint32) >> np.uint32(shift)  # many ties; short lists and long ones
+    order, other = np.empty((2, len(found)), np.uint64)
+    places = tiles.stable_order(found, order, other)[: len(found)] & np.uint64(0xFFFFFFFF)
+    np.testing.assert_array_equal(places, np.argsort(found, kind="stable"))
 
 
 def test_intersections_are_exact_sorted_and_consistent():

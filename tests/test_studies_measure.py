@@ -99,8 +99,7 @@ def test_files_against_a_file(files):
     ]
 
 
-def test_flip_is_measured_where_it_is(files):
-    pytest.importorskip("flip_evaluator", reason="needs the extra flip")
+def test_flip_is_measured(files):
     paths = [files / name for name in ("full.ply", "same.ply", "third.ply")]
     found = measure(paths, files / "out", settings(files), ignore)
     assert found.others == ["MS-SSIM", "FLIP"]

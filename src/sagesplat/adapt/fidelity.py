@@ -153,14 +153,16 @@ def measure_compositions(
 
     def at_viewpoint(row: int) -> None:
         camera, known = cameras[row], {}
-        at = references.at(camera)
+        compositions = [dict(zip(labels, levels, strict=True)) for levels in planned[row].tolist()]
+        at = references.at(camera, compositions)
         pixels[row] = at.pixels
-        for column, levels in enumerate(map(tuple, planned[row].tolist())):
+        for column, (levels, planned_here) in enumerate(
+            zip(map(tuple, planned[row].tolist()), compositions, strict=True)
+        ):
             if levels in known:
                 found[row, column] = found[row, known[levels]]
                 continue
             known[levels] = column
-            planned_here = dict(zip(labels, levels, strict=True))
             found[row, column, :-1], found[row, column, -1] = references.compare(planned_here, camera, at)
 
     for done, _ in enumerate(each_view(at_viewpoint, range(len(cameras)), device_of(backend)), 1):
@@ -221,29 +223,39 @@ class References:
             return self._last
         return RenderedLabels(self._given.to(device_of(self._backend)), self._backend, self._antialiased)
 
-    def at(self, camera: Camera) -> Reference:
-        """The full model's image and label image, and its levels, from a viewpoint."""
+    def at(self, camera: Camera, compositions: Sequence[Mapping[int, int]] | None = None) -> Reference:
+        """The full model's image and label image, and its levels, from a viewpoint.
+
+        `compositions`: those that will be compared; None: any. Levels that can be kept serve for any.
+        """
+        if isinstance(self._ladder, PrefixLadder) and self._left_levels >= 44 * len(self._ladder.gaussians):
+            compositions = None
         key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
         kept = self._kept.get(key)
-        found = kept or self._pictures(camera)
+        found = kept or self._pictures(camera, compositions)
         if found.levels is None and isinstance(self._ladder, PrefixLadder):
-            found = replace(found, levels=self._seen(camera, found.tile_mask))
+            found = replace(found, levels=self._seen(camera, found.tile_mask, compositions))
         if kept is None and found.nbytes <= self._left:
             self._left -= found.nbytes
-            stays = found.levels is not None and found.levels.nbytes <= self._left_levels
-            if found.levels is not None and stays:
+            stays = compositions is None and found.levels and found.levels.nbytes <= self._left_levels
+            if found.levels and stays:
                 self._left_levels -= found.levels.nbytes
             self._kept[key] = found if stays else replace(found, levels=None)
         return found
 
-    def _seen(self, camera: Camera, tile_mask: np.ndarray | None) -> Seen:
+    def _seen(
+        self,
+        camera: Camera,
+        tile_mask: np.ndarray | None,
+        compositions: Sequence[Mapping[int, int]] | None,
+    ) -> Seen:
         assert isinstance(self._ladder, PrefixLadder)
         return seen_from(
             self._ladder, camera, backend=self._backend, antialiased=self._antialiased,
-            workspace=self._workspace, tile_mask=tile_mask,
+            workspace=self._workspace, tile_mask=tile_mask, compositions=compositions,
         )  # fmt: skip
 
-    def _pictures(self, camera: Camera) -> Reference:
+    def _pictures(self, camera: Camera, compositions: Sequence[Mapping[int, int]] | None) -> Reference:
         """The full model's image and label image, with the levels where the latter is made from them."""
         tile_mask, levels, label_ids = None, None, None
         if not self.wanted.all():
@@ -251,8 +263,9 @@ class References:
             tile_mask = tiles_around(np.isin(label_ids, np.array(self.labels)[self.wanted]))
         image = self._full.paint(camera, tile_mask)
         if label_ids is None and isinstance(self._ladder, PrefixLadder):
-            levels = self._seen(camera, tile_mask)
-            label_ids = levels.label_ids(dict.fromkeys(self.labels, self._ladder.levels[-1]))
+            last = dict.fromkeys(self.labels, self._ladder.levels[-1])
+            levels = self._seen(camera, tile_mask, compositions and [*compositions, last])
+            label_ids = levels.label_ids(last)
         label_ids = self._last.render(camera) if label_ids is None else label_ids
         counts = np.bincount(label_ids.ravel().astype(np.int64) - UNLABELLED, minlength=2 + max(self.labels))
         pixels = counts[np.array(self.labels) - UNLABELLED].astype(np.int32)

@@ -396,8 +396,9 @@ def _each_image(
         cells = ladder.cells
 
         def in_view(row: int) -> tuple[int, list[dict[str, float]]]:
-            seen = seen_from(cells, scene.views[row].camera, tile_mask=views[row], **how)
-            images = ((level, seen.render(dict.fromkeys(cells.sizes, level))) for level in levels[row])
+            wanted = [dict.fromkeys(cells.sizes, level) for level in levels[row]]
+            seen = seen_from(cells, scene.views[row].camera, tile_mask=views[row], compositions=wanted, **how)
+            images = zip(levels[row], map(seen.render, wanted), strict=True)
             return len(levels[row]), [
                 found for level, image in images for found in compare(level, row, image)
             ]

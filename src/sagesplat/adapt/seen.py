@@ -1,6 +1,6 @@
 """Levels as one camera sees them: compositions that are rendered from it many times hold little else."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -126,11 +126,12 @@ def seen_from(
     antialiased: bool,
     workspace: Workspace,
     tile_mask: Bool[np.ndarray, "h w"] | None = None,
+    compositions: Sequence[Mapping[int, int]] | None = None,
 ) -> Seen:
     """The levels of a ladder as `camera` sees them; `antialiased`: how the model was trained.
 
     On a CPU all that have the same workspace render into the same memory. `tile_mask`: tiles of 16 x 16 px
-    that images are wanted in.
+    that images are wanted in. `compositions`: those that will be rendered (label id -> level); None: any.
     """
     if backend not in ("auto", "cpu") or camera.exposure is not None:
         return seen_levels(
@@ -140,7 +141,11 @@ def seen_from(
     g, second = ladder.gaussians, ladder.second
     weights = second.weights if second else {k: (0.0,) * len(v) for k, v in ladder.ranges.items()}
     logits = second.logits if second else None
-    drawn, rows = drawn_from(g, logits, weights, camera, antialiased, workspace, tile_mask)
+    used = None
+    if compositions is not None:
+        chosen = {pair for levels in compositions for pair in levels.items() if pair[0] in ladder.ranges}
+        used = [ladder.ranges[label][level - 1] for label, level in chosen]
+    drawn, rows = drawn_from(g, logits, weights, camera, antialiased, workspace, tile_mask, used)
     return SeenRecords(drawn, _ranges_among(ladder, rows))
 
 

@@ -2,10 +2,11 @@
 in the tiles that it meets at its largest one.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Int, Int32, Int64
 from numba import prange
 from torch import Tensor
@@ -21,6 +22,7 @@ from sagesplat.scene.scene import Camera
 _F = np.float32
 _LEAST = _F(np.log2(ALPHA_MIN))  # log2 of an opacity that is not drawn
 _CHUNK = 512  # rows that a thread takes at a time
+_NOWHERE = -30.0  # logit of what is not drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +104,18 @@ def drawn_from(
     antialiased: bool,
     workspace: Workspace,
     tile_mask: Bool[np.ndarray, "h w"] | None = None,
+    used: Iterable[tuple[int, int]] | None = None,
 ) -> tuple[Drawn, Int64[np.ndarray, " M"]]:
-    """What `camera` sees of Gaussians with their `second` opacities (logits [N]), if any; and their rows."""
+    """What `camera` sees of Gaussians with their `second` opacities (logits [N]), if any; and their rows.
+
+    `used`: ranges of rows (first, last + 1) that are drawn; None: all.
+    """
     first = g.logit_opacities
     most = first if second is None else first.maximum(second)
+    if used is not None:  # the others end a projection early, and are in no list
+        every, most = most, torch.full_like(most, _NOWHERE)
+        for begin, end in used:
+            most[begin:end] = every[begin:end]
     rows, records, lists = cpu.seen(
         replace(g, logit_opacities=most), camera, workspace, antialiased=antialiased, tile_mask=tile_mask
     )

@@ -44,7 +44,6 @@ EXTRAS = {  # of pyproject.toml: a package of each, and what it is for; `cuda` i
     "video": ("av", "frames of a video"),
     "heic": ("pi-heif", "photos of iPhones"),
     "ray": ("ray", "clusters"),
-    "flip": ("flip-evaluator", "FLIP, how visible differences are"),
 }
 
 _MARKS = {"fine": ("✓", "green"), "gap": ("·", "yellow"), "broken": ("✗", "red")}

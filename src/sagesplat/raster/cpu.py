@@ -302,7 +302,7 @@ def seen(
     options = _Options(camera, g.sh_degree, antialiased, tile_mask, workspace)
     records, depths, radii = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
     rows = np.flatnonzero(radii > 0)
-    records = records[rows]
+    records = records.take(rows, 0)  # indexing takes twice as long
     return rows, records, _intersections(options, records, depths[rows], radii[rows])
 
 

@@ -1,4 +1,8 @@
-"""Which Gaussian meets which tile, in depth order: one radix sort and counting placement."""
+"""Which Gaussian meets which tile, in depth order: counting placement by tile, then a sort in each tile.
+
+Gaussians are read in the order in which they lie in memory, and a tile's list fits into a core's cache: one
+sort of all by depth would fetch them from everywhere, which takes longer than the sort.
+"""
 
 from dataclasses import dataclass
 
@@ -6,14 +10,15 @@ import numpy as np
 from numba import prange
 
 from sagesplat.kernels.jit import njit
-from sagesplat.kernels.simd import prefetch
 from sagesplat.kernels.workspace import Workspace
-from sagesplat.raster.blend import RECORD, TILE
+from sagesplat.raster.blend import TILE
 from sagesplat.raster.project import tile_box
 from sagesplat.raster.render import ALPHA_MIN
 
-_AHEAD = 16  # Gaussians that are fetched before their turn: in order of depth they lie anywhere
 _CHUNKS = 16  # fixed, so that the result does not depend on the number of threads
+_APART = 5  # each thread's stretch of chunks has some from all over
+_DIGIT = 11  # most bits that a pass of the sort looks at; fewer where lists are shorter than its counters
+_FEW = 32  # entries that are sorted by insertion alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,32 +30,6 @@ class Intersections:
     ids: np.ndarray  # int32 [I], Gaussian of each intersection
     slots: np.ndarray  # int32 [I]
     offsets: np.ndarray  # int64 [N + 1], first slot of each Gaussian
-
-
-@njit(cache=True)
-def depth_order(depths, radii):
-    """Indices of the drawn Gaussians (radius > 0), front to back; stable (LSD radix on the float's bits)."""
-    n = 0
-    for i in range(len(depths)):
-        n += radii[i] > 0
-    order, other = np.empty(n, np.int32), np.empty(n, np.int32)
-    bits = depths.view(np.uint32)  # positive floats sort as their bits do
-    n = 0
-    for i in range(len(depths)):
-        if radii[i] > 0:
-            order[n] = i
-            n += 1
-    for shift in (0, 11, 22):
-        starts = np.zeros(2049, np.int64)
-        for i in order:
-            starts[((bits[i] >> np.uint32(shift)) & np.uint32(2047)) + 1] += 1
-        starts = np.cumsum(starts)
-        for i in order:
-            digit = (bits[i] >> np.uint32(shift)) & np.uint32(2047)
-            other[starts[digit]] = i
-            starts[digit] += 1
-        order, other = other, order
-    return order
 
 
 @njit(error_model="numpy", forceinline=True, cache=True)
@@ -82,37 +61,42 @@ def _touches(records, i, tile_x, tile_y, threshold):
 
 
 @njit(parallel=True, cache=True)
-def _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per_gaussian, boxes, met):
-    """Counts; for `_place` each Gaussian's box of tiles, and a bit for each of its first 64 that it meets."""
-    for chunk in prange(_CHUNKS):
-        for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
-            i, ahead = order[k], np.int64(order[min(k + _AHEAD, len(order) - 1)])
-            prefetch(records, ahead * RECORD)
-            prefetch(records, ahead * RECORD + RECORD - 1)
-            x0, x1, y0, y1 = tile_box(
-                records[i, 0], records[i, 1], records[i, 9], records[i, 10], tiles_x, tiles_y
-            )
-            boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3] = x0, x1, y0, y1
+def _count(records, radii, tiles_x, tiles_y, tile_mask, threshold, per_tile, offsets, boxes, met):
+    """Counts, that of Gaussian i into offsets[i + 1]; for `_place` its box of tiles, and a bit for each of
+    the first 64 that it meets.
+    """
+    offsets[0] = 0
+    for place in prange(_CHUNKS):
+        chunk = place * _APART % _CHUNKS
+        for i in range(chunk * len(radii) // _CHUNKS, (chunk + 1) * len(radii) // _CHUNKS):
             bits, bit, total = np.uint64(0), np.uint64(1), 0
-            for y in range(y0, y1):
-                for x in range(x0, x1):
-                    if tile_mask[y * tiles_x + x] and _touches(records, i, x, y, threshold):
-                        per_tile[chunk, y * tiles_x + x] += 1
-                        bits |= bit
-                        total += 1
-                    bit <<= np.uint64(1)
-            met[k] = bits
-            per_gaussian[i] = total
+            if radii[i] > 0:
+                x0, x1, y0, y1 = tile_box(
+                    records[i, 0], records[i, 1], records[i, 9], records[i, 10], tiles_x, tiles_y
+                )
+                boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, x1, y0, y1
+                for y in range(y0, y1):
+                    for x in range(x0, x1):
+                        if tile_mask[y * tiles_x + x] and _touches(records, i, x, y, threshold):
+                            per_tile[chunk, y * tiles_x + x] += 1
+                            bits |= bit
+                            total += 1
+                        bit <<= np.uint64(1)
+            met[i] = bits
+            offsets[i + 1] = total
 
 
 @njit(parallel=True, cache=True)
-def _place(records, order, tiles_x, tile_mask, threshold, boxes, met, cursor, offsets, ids, slots):
-    for chunk in prange(_CHUNKS):
-        for k in range(chunk * len(order) // _CHUNKS, (chunk + 1) * len(order) // _CHUNKS):
-            i = order[k]
-            prefetch(offsets, np.int64(order[min(k + _AHEAD, len(order) - 1)]))
-            slot, bits = offsets[i], met[k]
-            x0, x1, y0, y1 = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
+def _place(records, depths, tiles_x, tile_mask, threshold, boxes, met, cursor, offsets, ids, slots, keys):
+    """Lists by tile, in the order of the Gaussians; `keys`: bits of their depths, which sort as these do."""
+    bits_of = depths.view(np.uint32)  # of positive floats
+    for place in prange(_CHUNKS):
+        chunk = place * _APART % _CHUNKS
+        for i in range(chunk * len(depths) // _CHUNKS, (chunk + 1) * len(depths) // _CHUNKS):
+            slot, bits = offsets[i], met[i]
+            if slot == offsets[i + 1]:
+                continue
+            x0, x1, y0, y1 = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
             small = (x1 - x0) * (y1 - y0) <= 64
             for y in range(y0, y1):
                 for x in range(x0, x1):
@@ -125,9 +109,70 @@ def _place(records, order, tiles_x, tile_mask, threshold, boxes, met, cursor, of
                     if meets:
                         at = cursor[chunk, tile]
                         cursor[chunk, tile] = at + 1
-                        ids[at] = i
-                        slots[at] = slot
+                        ids[at], slots[at], keys[at] = i, slot, bits_of[i]
                         slot += 1
+
+
+@njit(cache=True)
+def stable_order(keys, order, other):
+    """The places of keys [n] uint32, ascending, of equal ones in their order: low halves of order[:n] uint64.
+
+    Two passes of an LSD radix sort over the highest bits in which keys differ leave little to an insertion.
+    `order`, or `other`, both of n elements at least, is returned.
+    """
+    n, low, high = len(keys), np.uint32(0xFFFFFFFF), np.uint32(0)
+    for key in keys:
+        low, high = min(low, key), max(high, key)
+    for i in range(n):
+        order[i] = (np.uint64(keys[i] - low) << np.uint64(32)) | np.uint64(i)
+    spread, width, digit = max(np.int64(high) - np.int64(low), 0), 0, 4  # of no keys none
+    while spread >> width:
+        width += 1
+    while digit < _DIGIT and n >> digit + 1:
+        digit += 1
+    counters = np.empty((1 << _DIGIT) + 1, np.int64)
+    skipped, passes = max(width - 2 * digit, 0), 2 if n > _FEW else 0
+    for k in range(passes):
+        first = skipped + (width - skipped) * k // passes
+        last = skipped + (width - skipped) * (k + 1) // passes
+        shift, mask = np.uint64(32 + first), np.uint64((1 << (last - first)) - 1)
+        starts = counters[: (1 << (last - first)) + 1]
+        starts[:] = 0
+        for i in range(n):
+            starts[np.int64((order[i] >> shift) & mask) + 1] += 1
+        for at in range(1, len(starts)):
+            starts[at] += starts[at - 1]
+        for i in range(n):
+            at = np.int64((order[i] >> shift) & mask)
+            other[starts[at]] = order[i]
+            starts[at] += 1
+        order, other = other, order
+    for i in range(1, n):  # entries differ by their places, so that none are equal
+        entry, at = order[i], i
+        while at > 0 and order[at - 1] > entry:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = entry
+    return order
+
+
+@njit(parallel=True, cache=True)
+def _sort(starts, tiles_x, rows, keys, ids, slots):
+    """Sort each tile's list by depth, front to back; of equal depths by Gaussian."""
+    for r in prange(len(rows)):
+        begin = rows[r] * tiles_x
+        longest = 0
+        for tile in range(begin, begin + tiles_x):
+            longest = max(longest, starts[tile + 1] - starts[tile])
+        order, other = np.empty(longest, np.uint64), np.empty(longest, np.uint64)
+        of, by = np.empty(longest, np.int32), np.empty(longest, np.int32)
+        for tile in range(begin, begin + tiles_x):
+            first, last = starts[tile], starts[tile + 1]
+            sorted_places = stable_order(keys[first:last], order, other)
+            of[: last - first], by[: last - first] = ids[first:last], slots[first:last]
+            for k in range(last - first):
+                place = np.int64(sorted_places[k] & np.uint64(0xFFFFFFFF))
+                ids[first + k], slots[first + k] = of[place], by[place]
 
 
 def row_order(tiles_y: int) -> np.ndarray:
@@ -147,18 +192,17 @@ def intersect(
 ) -> Intersections:
     """List every (tile, Gaussian) pair in which the Gaussian is visible, by tile, front to back."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    order = depth_order(depths, radii)
     # a hair below the blending threshold, so that rounding never loses a pixel
-    threshold = np.float32(np.log2(ALPHA_MIN) - 1e-3)
-    per_tile = np.zeros((_CHUNKS, tiles_x * tiles_y), np.int64)
-    per_gaussian = np.zeros(len(depths), np.int64)
-    boxes = workspace.take("boxes", len(order), 4, dtype=np.int32)
-    met = workspace.take("met", len(order), dtype=np.uint64)
-    _count(records, order, tiles_x, tiles_y, tile_mask, threshold, per_tile, per_gaussian, boxes, met)
-    offsets = np.concatenate([[0], np.cumsum(per_gaussian)])
+    threshold, take, n = np.float32(np.log2(ALPHA_MIN) - 1e-3), workspace.take, len(depths)
+    per_tile, offsets = np.zeros((_CHUNKS, tiles_x * tiles_y), np.int64), np.empty(n + 1, np.int64)
+    boxes, met = take("boxes", n, 4, dtype=np.int32), take("met", n, dtype=np.uint64)
+    _count(records, radii, tiles_x, tiles_y, tile_mask, threshold, per_tile, offsets, boxes, met)
+    np.cumsum(offsets, out=offsets)
     ends = np.cumsum(per_tile.T.ravel())  # by tile, then by chunk
     cursor = np.ascontiguousarray((ends - per_tile.T.ravel()).reshape(-1, _CHUNKS).T)
-    starts = np.append(cursor[0], ends[-1:])
-    ids, slots = (workspace.take(name, offsets[-1], dtype=np.int32) for name in ("ids", "slots"))
-    _place(records, order, tiles_x, tile_mask, threshold, boxes, met, cursor, offsets, ids, slots)
-    return Intersections(row_order(tiles_y), starts, ids, slots, offsets)
+    starts, rows = np.append(cursor[0], ends[-1:]), row_order(tiles_y)
+    ids, slots = (take(name, offsets[-1], dtype=np.int32) for name in ("ids", "slots"))
+    keys = take("keys", offsets[-1], dtype=np.uint32)
+    _place(records, depths, tiles_x, tile_mask, threshold, boxes, met, cursor, offsets, ids, slots, keys)
+    _sort(starts, tiles_x, rows, keys, ids, slots)
+    return Intersections(rows, starts, ids, slots, offsets)

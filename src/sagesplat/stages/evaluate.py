@@ -9,7 +9,7 @@ from sagesplat.adapt.evaluate import OTHERS, Evaluation, Similarity, evaluate
 from sagesplat.adapt.observe import TOTAL
 from sagesplat.adapt.plan import Plan
 from sagesplat.core.events import Progress
-from sagesplat.metrics.flip import flip_map, missing
+from sagesplat.metrics.flip import flip_map
 from sagesplat.metrics.lpips import load_lpips, weights_path
 from sagesplat.metrics.ms_ssim import ms_ssim
 from sagesplat.output import tables
@@ -27,14 +27,14 @@ def evaluate_plans(job: Job) -> None:
     """Measure the compositions on the test views, beside what was promised and the full model."""
     run, method = job.run, method_of(job)
 
-    flip, lpips = missing() is None, weights_path("alex")
+    lpips = weights_path("alex")
 
     def make() -> list[str]:
         within = budget_plan_of(job)
         plans = [*plans_of(job), *([within] if within else [])]
         table = evaluate(
             job.scene, job.photos, job.level_masks, job.ladder, plans, method.predicted,
-            others=_others(flip, lpips), uniform=_levels_beside(job, plans),
+            others=_others(lpips), uniform=_levels_beside(job, plans),
             full=job.came_in, valid=job.valid,
             backend=job.backend, antialiased=job.antialiased,
             progress=lambda done, total: job.emit(Progress("evaluate", done, total)),
@@ -48,15 +48,16 @@ def evaluate_plans(job: Job) -> None:
 
     fitted = [run.provenance("observe"), run.provenance("fit")]
     inputs = [run.labels, *method.files, *fitted, *compose_inputs(job)]
-    settings = {"flip": flip, "lpips": file_hash(lpips) if lpips.is_file() else None}
+    settings = {"lpips": file_hash(lpips) if lpips.is_file() else None}
     run_stage(job, "evaluate", settings, inputs, [run.evaluation], make)
 
 
-def _others(flip: bool, lpips: Path) -> dict[str, Similarity]:
-    """MS-SSIM; FLIP where its extra is installed, LPIPS where its weights were downloaded."""
-    found: dict[str, Similarity] = {"ms_ssim": ms_ssim}
-    if flip:
-        found["flip"] = lambda image, photo: float(flip_map(image, photo).mean())
+def _others(lpips: Path) -> dict[str, Similarity]:
+    """MS-SSIM and FLIP; LPIPS where its weights were downloaded."""
+    found: dict[str, Similarity] = {
+        "ms_ssim": ms_ssim,
+        "flip": lambda image, photo: float(flip_map(image, photo).mean()),
+    }
     if lpips.is_file():
         found["lpips"] = load_lpips("alex", lpips)
     return found

@@ -4,9 +4,11 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from sagesplat.adapt.observe import render_rgb
+from sagesplat.core.gaussians import Gaussians
 from sagesplat.metrics.image import ssim_map
 from sagesplat.output.report_data import Look
 from sagesplat.output.tables import bytes_of, last_counts
+from sagesplat.raster import Workspace
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.methods import method_of
@@ -30,20 +32,23 @@ def looks(job: Job, scale: float = 1.0) -> list[Look]:
     rows = scene.test_ids if len(scene.test_ids) else scene.train_ids
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, _VIEWS).round().astype(int))]
     cameras = [_scaled(scene.views[row].camera.neutral, scale) for row in rows.tolist()]
-    scenes = [plan.compose(job.ladder) for plan in plans]
-    worst, found = -1.0, None
+    space = Workspace()
+
+    def picture(g: Gaussians, camera: Camera) -> np.ndarray:
+        return render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased, workspace=space)
+
+    lowest, worst, found = plans[0].compose(job.ladder), -1.0, None
     for camera in cameras:
-        images = [
-            render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased) for g in (full, scenes[0])
-        ]
-        difference, part = _furthest(1 - ssim_map(images[1], images[0]))
+        whole, image = picture(full, camera), picture(lowest, camera)
+        difference, part = _furthest(1 - ssim_map(image, whole))
         if difference > worst:
-            worst, found = difference, (camera, images[0], part)
+            worst, found = difference, (camera, whole, image, part)
     assert found is not None  # a scene has views
-    camera, whole, part = found
-    shown = []
-    for plan, g in zip(plans, scenes, strict=True):
-        image = render_rgb(g, camera, backend=job.backend, antialiased=job.antialiased)
+    camera, whole, image, part = found
+    shown, levels = [], (plans[0].levels, plans[0].cells)
+    for plan in plans:
+        if (plan.levels, plan.cells) != levels:  # low targets often have one plan; one composition at a time
+            image, levels = picture(plan.compose(job.ladder), camera), (plan.levels, plan.cells)
         similar = ssim_map(image, whole)
         nbytes = sum(map(bytes_of, plan.choices))
         shown.append(

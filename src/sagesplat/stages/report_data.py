@@ -26,6 +26,7 @@ from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands
 from sagesplat.output.place_figures import Place
 from sagesplat.output.report_data import PromiseFacts, ReportData
+from sagesplat.raster import Workspace
 from sagesplat.run.capture import read_capture
 from sagesplat.run.job import Job
 from sagesplat.run.records import read_record, settings_of, uses
@@ -233,11 +234,11 @@ def picture_panels(job: Job, composed: Gaussians) -> list[Panel]:
     if not len(rows):
         rows = tests[:1]
     full = ladder.load(ladder.levels[-1])
-    panels = []
+    panels, space = [], Workspace()
     for row in rows.tolist():
         view, photo = scene.views[row], photos[row]
         images = [
-            render_rgb(g, view.camera, backend=job.backend, antialiased=job.antialiased)
+            render_rgb(g, view.camera, backend=job.backend, antialiased=job.antialiased, workspace=space)
             for g in (full, composed)
         ]
         of_full, of_composed = (measure_total(image, as_unit(photo), job.valid[view]) for image in images)

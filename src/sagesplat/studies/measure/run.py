@@ -16,7 +16,6 @@ from sagesplat.core.geometry import Position
 from sagesplat.formats.splat import relative_to
 from sagesplat.formats.splats import Splat
 from sagesplat.io.typed import check_limits
-from sagesplat.metrics import flip
 from sagesplat.metrics.image import ssim_map
 from sagesplat.output.contact_sheet import contact_sheet
 from sagesplat.raster import Backend, prepared
@@ -99,17 +98,15 @@ def _measure(
             f"{config.cameras}: no camera has {reference.name} in sight; give cameras of this scene"
         )
     metrics = load_metrics(emit, config.lpips)
-    if (no_flip := flip.missing()) is not None:
-        emit(Warned(f"no FLIP: {no_flip}"))
 
     def done(images: int) -> None:
         emit(Progress("measure", images, total))
 
-    rows, counts = compare(truth, levels, cameras, metrics, renderer, done, no_flip is None)
+    rows, counts = compare(truth, levels, cameras, metrics, renderer, done)
     measured = Measured(
         reference.name, len(truth.gaussians), names, [level.series for level in levels], counts,
         [level.nbytes for level in levels], views, truth.names,
-        [MS_SSIM, *([] if no_flip else [FLIP]), *metrics], rows,
+        [MS_SSIM, FLIP, *metrics], rows,
     )  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
     up = np.mean([-camera.w2c[1, :3] for camera in cameras], axis=0)

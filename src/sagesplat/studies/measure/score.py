@@ -69,12 +69,11 @@ def compare(
     metrics: Mapping[str, Lpips],
     renderer: Renderer,
     done: Callable[[int], None],
-    flip: bool = False,
 ) -> tuple[list[Row], list[int]]:
     """Measure levels in all viewpoints: the measurements, and the number of Gaussians of each level.
 
     The labels of `reference` say where the categories are; `metrics`: LPIPS by column; `done` hears how many
-    images were compared; `flip`: measure FLIP as well.
+    images were compared.
     """
     rows: list[Row] = []
     counts: list[int] = []
@@ -91,8 +90,7 @@ def compare(
             seen = {name: metric.features(truth) for name, metric in metrics.items()}
             for number, splat in enumerate(splats, begin):
                 image = renderer.rgb(splat, camera)
-                others = {MS_SSIM: ms_ssim(image, truth)}
-                others |= {FLIP: float(flip_map(image, truth).mean())} if flip else {}
+                others = {MS_SSIM: ms_ssim(image, truth), FLIP: float(flip_map(image, truth).mean())}
                 others |= {
                     n: metric.distance(metric.features(image), seen[n]) for n, metric in metrics.items()
                 }
