@@ -104,7 +104,7 @@ def _gaussians(mixture: _Mixture, before: Gaussians) -> Gaussians:
     quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1) if len(new) else np.zeros((0, 4))
     opacities = mixture.opacities[new].clip(1 - _CLOSED, _CLOSED)
     smallest = variances.max(1, keepdims=True) * 1e-12
-    sh = mixture.sh[new].reshape(len(new), -1, 3)
+    sh = mixture.sh[new].reshape(len(new), mixture.sh.shape[1] // 3, 3)
     merged = {
         "means": mixture.means[new],
         "quats": quats,
@@ -217,16 +217,16 @@ def _pairs(near):  # type: ignore[no-untyped-def]
     return first, second
 
 
-def _cheapest(
-    cost: np.ndarray, first: np.ndarray, second: np.ndarray, count: int, most: int
-) -> np.ndarray:
+def _cheapest(cost: np.ndarray, first: np.ndarray, second: np.ndarray, count: int, most: int) -> np.ndarray:
     """Numbers of the pairs that merge, the cheapest first, at most `most` and no row of `count` twice."""
     used, chosen, found = np.zeros(count, bool), np.empty(most, np.int64), 0
     left = np.arange(len(cost))
     while found < most and len(left):  # to sort some at a time saves what their mergers rule out
         costs = cost[left]
         cheap = costs <= np.quantile(costs[::_SAMPLED], min(_SORTED * most / len(left), 1), method="lower")
-        found = _choose(left[cheap][np.argsort(costs[cheap], kind="stable")], first, second, used, chosen, found)
+        found = _choose(
+            left[cheap][np.argsort(costs[cheap], kind="stable")], first, second, used, chosen, found
+        )
         left = left[~cheap]
         left = left[~used[first[left]] & ~used[second[left]]]
     return chosen[:found]
