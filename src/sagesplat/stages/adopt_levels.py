@@ -164,8 +164,8 @@ def _fitted(job: Job, targets: Photos, rungs: Sequence[Rung]) -> list[Gaussians]
         )  # fmt: skip
         return [fitted.to("cpu")]
 
-    # the first item would have all threads, which takes longer than with one
-    return [g for found in each_view(fit, [None, *rungs], device) for g in found]
+    # the first item would have all threads, which takes longer than with one; large ones take longest
+    return [g for found in each_view(fit, [None, *rungs[::-1]], device) for g in found][::-1]
 
 
 def _trained(
