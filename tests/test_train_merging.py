@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sagesplat.core.gaussians import Gaussians
-from sagesplat.train.merging import Merged, merge
+from sagesplat.train.merging import Merged, _cheapest, _pairs, merge
 
 
 def _cloud(count: int, **options: Any) -> Gaussians:
@@ -124,3 +124,32 @@ def test_categories_do_not_merge() -> None:
     for row, into in enumerate(found.into):
         assert found.gaussians.label_ids[into] == g.label_ids[row]
     assert len(_merged(g, 1).gaussians) == 2
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 1000), st.integers(2, 60), st.integers(1, 6))
+def test_every_pair_of_neighbours_once(seed: int, count: int, near: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = np.stack([rng.choice(count, min(near, count), replace=False) for _ in range(count)])
+    first, second = _pairs(rows.astype(np.int32))
+    found = list(zip(first.tolist(), second.tolist(), strict=True))
+    assert len(set(found)) == len(found)
+    wanted = {(min(i, j), max(i, j)) for i, row in enumerate(rows.tolist()) for j in row if i != j}
+    assert set(found) == wanted
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 1000), st.integers(2, 200), st.booleans())
+def test_the_cheapest_pairs_are_those_of_all_pairs_in_order(seed: int, count: int, ties: bool) -> None:
+    """Sorting some at a time takes the same pairs as going through all of them by cost."""
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, count - 1, 6 * count)
+    second = rng.integers(first + 1, count)
+    cost = rng.integers(0, 5, len(first)).astype(float) if ties else rng.random(len(first))
+    for most in (1, count // 3 + 1, count):
+        used, wanted = set[int](), list[int]()
+        for pair in np.argsort(cost, kind="stable").tolist():
+            if len(wanted) < most and not used & {first[pair], second[pair]}:
+                used |= {first[pair], second[pair]}
+                wanted.append(pair)
+        assert _cheapest(cost, first, second, count, most).tolist() == wanted

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from sagesplat.formats.levels import write_set
 from sagesplat.formats.stream_header import AS_GIVEN, Precision, rounded
 from sagesplat.formats.stream_increments import write_streams
 from sagesplat.metrics.image import ssim_map
-from sagesplat.raster import Workspace, device_of
+from sagesplat.raster import Workspace, device_of, each_view
 from sagesplat.run.job import Job
 from sagesplat.run.records import checkpoint_key
 from sagesplat.run.stage import run_stage
@@ -53,7 +52,7 @@ from sagesplat.train.refit import fit_to_renders, refit_coverage
 
 _WEIGH = 32  # views that importance is measured in
 _REFIT = 24  # views that merged sets are fitted to, and trained ones are ordered by
-_TRAINED = 0.5  # largest share that is trained
+_TRAINED = 0.5  # largest share that is trained; larger ones are seldom closer merged
 _SMALL = 0.1  # share up to which the fit takes more and larger steps: little is left as it was
 KEPT = 0.999  # SSIM of the last level to what came in, from which it looks the same
 _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are compared in
@@ -73,21 +72,8 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     def make() -> list[str]:
         if config.fit == "renders":
             check_nest(job, len(g), g.sh_degree)
-        key = checkpoint_key(run, settings, inputs)
-        targets = Renders(g, job.scene.views, job.backend, job.antialiased, photo_cache(job.memory_limit))
-        views = spread(job.scene.train_ids.tolist(), _WEIGH)
-        weights = importance(g, job.scene, views, "weight", antialiased=job.antialiased)
-        order = importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased)
-        ordered = g.select(torch.from_numpy(np.argsort(-order, kind="stable")))
-        sets = _lower_levels(job, targets, ordered, merged_rungs(g, weights, shares[:-1]), views, config, key)
-        num_lower = sum(len(one.levels) for one in sets)
-        least: Counts = sets[-1].levels[-1] if sets else {}
-        levels = list[Counts]()
-        for share in shares[num_lower:]:
-            least = first_of_all(ordered, share, least).counts()
-            levels.append(least)
-        ladder = assemble([*sets, Set(ordered, tuple(levels))])
-        ladder, label_of = in_cells(ladder, cells_wanted(len(ordered)))
+        ladder, num_lower = _ladder(job, g, shares, config, checkpoint_key(run, settings, inputs))
+        ladder, label_of = in_cells(ladder, cells_wanted(len(g)))
         lines = _write(job, ladder, label_of, num_lower, g, settings, config.lossless)
         remove_checkpoints(run.nest_checkpoint)
         return lines
@@ -95,11 +81,31 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.cells, run.increments], make, swaps=True)
 
 
+def _ladder(
+    job: Job, g: Gaussians, shares: Sequence[float], config: AdoptConfig, key: str
+) -> tuple[Assembled, int]:
+    """All levels, and how many of them are not prefixes of the originals."""
+    targets = Renders(g, job.scene.views, job.backend, job.antialiased, photo_cache(job.memory_limit))
+    views = spread(job.scene.train_ids.tolist(), _WEIGH)
+    weights = importance(g, job.scene, views, "weight", antialiased=job.antialiased)
+    order = importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased)
+    ordered = g.select(torch.from_numpy(np.argsort(-order, kind="stable")))
+    rungs = merged_rungs(g, weights, shares[:-1])
+    sets = _lower_levels(job, targets, ordered, rungs, views, config, key)
+    num_lower = sum(len(one.levels) for one in sets)
+    least: Counts = sets[-1].levels[-1] if sets else {}
+    levels = list[Counts]()
+    for share in shares[num_lower:]:
+        least = first_of_all(ordered, share, least).counts()
+        levels.append(least)
+    return assemble([*sets, Set(ordered, tuple(levels))]), num_lower
+
+
 def _lower_levels(
     job: Job,
     targets: Photos,
     ordered: Gaussians,
-    rungs: Sequence[Rung],
+    rungs: list[Rung],
     views: Sequence[int],
     config: AdoptConfig,
     key: str,
@@ -109,42 +115,57 @@ def _lower_levels(
     Trained ones start from whichever is closer to the originals: merged Gaussians, or as many of the most
     important ones. Of the larger ones, those that are closer merged stay merged.
     """
-    covering = partial(refit_coverage, scene=job.scene, views=views, antialiased=job.antialiased)
-    rungs = [replace(rung, gaussians=covering(rung.gaussians, rung.stands_for)) for rung in rungs]
-    pruned, least = list[Gaussians](), dict[int, int]()
-    for rung in rungs:
-        pruned.append(first_of_all(ordered, rung.share, least))
-        least = rung.gaussians.counts()
-    merges = _merges_until(job, targets, [rung.gaussians for rung in rungs], pruned)
-    small = [rung for rung in rungs if rung.share <= _TRAINED] if config.fit == "renders" else []
+    rows = spread(job.scene.train_ids.tolist(), _COMPARE)
+    compared = {row: as_unit(targets[row]) for row in rows}
+
+    def pruned(number: int) -> Gaussians:
+        least = rungs[number - 1].gaussians.counts() if number else {}
+        return first_of_all(ordered, rungs[number].share, least)
+
+    def closer_merged(number: int) -> bool:
+        return _ssim(job, rungs[number].gaussians, compared) > _ssim(job, pruned(number), compared)
+
+    likely = sum(rung.share <= _TRAINED for rung in rungs)
+    rungs[:likely] = [_covering(job, rung, views) for rung in rungs[:likely]]
+    merges = likely
+    while merges and not closer_merged(merges - 1):
+        merges -= 1
+    while likely <= merges < len(rungs):
+        rungs[merges] = _covering(job, rungs[merges], views)
+        if not closer_merged(merges):
+            break
+        merges += 1
+    small = rungs[:likely] if config.fit == "renders" else []
     starts = {
-        rung.share: rung.gaussians if number < merges else pruned[number] for number, rung in enumerate(small)
+        rung.share: rung.gaussians if number < merges else pruned(number) for number, rung in enumerate(small)
     }
     sets = _trained(job, targets, starts, config, key) if starts else []
-    return sets + [whole(_fitted(job, targets, rung)) for rung in rungs[len(small) : merges]]
+    return sets + [whole(g) for g in _fitted(job, targets, rungs[len(small) : merges])]
 
 
-def _fitted(job: Job, targets: Photos, rung: Rung) -> Gaussians:
-    rows = spread(job.scene.train_ids.tolist(), _REFIT)
+def _covering(job: Job, rung: Rung, views: Sequence[int]) -> Rung:
+    covering = refit_coverage(rung.gaussians, rung.stands_for, job.scene, views, antialiased=job.antialiased)
+    return replace(rung, gaussians=covering)
+
+
+def _fitted(job: Job, targets: Photos, rungs: Sequence[Rung]) -> list[Gaussians]:
+    """The rungs fitted to renders of the originals, side by side: threads gain little within a step."""
+    rows, device = spread(job.scene.train_ids.tolist(), _REFIT), device_of(job.backend)
     cameras = [job.scene.views[row].camera for row in rows]
-    device = device_of(job.backend)
     images = [torch.from_numpy(as_unit(targets[row])).to(device) for row in rows]
-    passes, rate = (5, 2.0) if rung.share <= _SMALL else (3, 1.0)
-    fitted = fit_to_renders(
-        rung.gaussians.to(device), cameras, images, passes, rate, antialiased=job.antialiased,
-        backend=job.backend,
-    )  # fmt: skip
-    return fitted.to("cpu")
 
+    def fit(rung: Rung | None) -> list[Gaussians]:
+        if rung is None:
+            return []
+        passes, rate = (5, 2.0) if rung.share <= _SMALL else (3, 1.0)
+        fitted = fit_to_renders(
+            rung.gaussians.to(device), cameras, images, passes, rate, antialiased=job.antialiased,
+            backend=job.backend,
+        )  # fmt: skip
+        return [fitted.to("cpu")]
 
-def _merges_until(job: Job, targets: Photos, merged: Sequence[Gaussians], pruned: Sequence[Gaussians]) -> int:
-    """How many levels are better merged than pruned to the most important originals; larger ones are not."""
-    rows = spread(job.scene.train_ids.tolist(), _COMPARE)
-    for number in range(len(merged), 0, -1):
-        one, other = (_ssim(job, targets, some[number - 1], rows) for some in (merged, pruned))
-        if one > other:
-            return number
-    return 0
+    # the first item would have all threads, which takes longer than with one; large ones take longest
+    return [g for found in each_view(fit, [None, *rungs[::-1]], device) for g in found][::-1]
 
 
 def _trained(
@@ -240,11 +261,14 @@ def _kept(job: Job, top: Gaussians, targets: Sequence[tuple[int, np.ndarray]]) -
     return ssim, -10 * float(np.log10(error)) if error else float("inf")
 
 
-def _ssim(job: Job, targets: Photos, g: Gaussians, rows: Sequence[int]) -> float:
+def _ssim(job: Job, g: Gaussians, targets: Mapping[int, np.ndarray]) -> float:
+    """Mean SSIM to images by view."""
     space = Workspace()
-    return float(
-        np.mean([ssim_map(_image(job, g, row, space), as_unit(targets[row])).mean() for row in rows])
-    )
+
+    def in_view(row: int) -> float:
+        return float(ssim_map(_image(job, g, row, space), targets[row]).mean())
+
+    return float(np.mean(list(each_view(in_view, list(targets), device_of(job.backend)))))
 
 
 def _image(job: Job, g: Gaussians, row: int, space: Workspace) -> np.ndarray:

@@ -40,14 +40,18 @@ def importance(
     if criterion == "sensitivity":
         return _sensitivity(g, scene, views, valid, antialiased, seed)
     total, workspace = np.zeros(len(g), np.float32), Workspace()
-    for row in views:
+
+    def in_view(row: int) -> np.ndarray:
         camera, counts = scene.views[row].camera, valid[scene.views[row]]
         weights = np.zeros((len(g), 1), np.float32)
         columns = np.zeros((camera.height, camera.width), np.int64)
         if counts is not None:
             columns[~counts] = -1
         add_weights(g, camera, columns, weights, antialiased=antialiased, workspace=workspace)
-        total += weights[:, 0]
+        return weights[:, 0]
+
+    for of_view in each_view(in_view, list(views), g.means.device):
+        total += of_view
     if criterion == "weight-volume" and len(g):
         volumes = torch.exp(g.log_scales.detach().sum(1)).cpu().numpy()
         total *= np.clip(volumes / np.quantile(volumes, _LARGE), 0, 1) ** _VOLUME_POWER

@@ -155,9 +155,9 @@ def in_cells(ladder: Assembled, count: int) -> tuple[Assembled, dict[int, int]]:
     label_of = dict[int, int]()
     for label, rows in rows_of.items():
         mine = split[labels[originals] == label]
-        nearest = KDTree(means[rows[begins[label] :]]).query(means[rows])[1]
-        nearest[begins[label] :] = np.arange(len(mine))
-        _, own = np.unique(mine[nearest], return_inverse=True)
+        lower, upper = np.split(means[rows], [begins[label]])
+        nearest = KDTree(upper).query(lower, workers=-1)[1] if len(lower) else np.zeros(0, np.int64)
+        _, own = np.unique(np.concatenate([mine[nearest], mine]), return_inverse=True)
         sizes, replaces = ladder.sizes[label], ladder.replaces[label]
         starts = [0, *(sizes[level - 2] for level in replaces)]
         firsts = [sizes[0], *(sizes[level - 1] for level in replaces)]

@@ -8,7 +8,8 @@ integrated over space, blurred by a part of the size, and weighted by how visibl
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +27,9 @@ _ROUND = 0.35  # pairs that merge in a round at most, as a share of the Gaussian
 _BLUR = 0.25  # variance that differences are blurred by, as a share of the merged one's area
 _HIDDEN = 1e-3  # visibility of what no render shows
 _OPACITY = 2.0  # weight of a difference in opacity, beside one in a colour channel
+_SORTED = 2  # cheapest pairs that are sorted at a time, for each that merges
+_SAMPLED = 16  # one of so many pairs is looked at to find which are the cheapest
+_ITSELF = 8**0.5  # volume of a Gaussian over its overlap with itself: covariances add
 _CLOSED = 0.9999  # opacity of what hides all behind it, so that its logit is finite
 _UPPER = [0, 1, 2, 4, 5, 8]  # entries of a symmetric 3 x 3 matrix that are stored
 _WHOLE = [0, 1, 2, 1, 3, 4, 2, 4, 5]
@@ -94,31 +98,32 @@ def _mixture(g: Gaussians, weights: np.ndarray) -> _Mixture:
 
 
 def _gaussians(mixture: _Mixture, before: Gaussians) -> Gaussians:
-    variances, axes = np.linalg.eigh(mixture.covs[:, _WHOLE].reshape(-1, 3, 3))
+    new = np.flatnonzero(mixture.origin < 0)
+    variances, axes = np.linalg.eigh(mixture.covs[new][:, _WHOLE].reshape(-1, 3, 3))
     axes[np.linalg.det(axes) < 0, :, 0] *= -1  # a rotation, not a reflection
-    quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1)
-    opacities = mixture.opacities.clip(1 - _CLOSED, _CLOSED)
-    sh = mixture.sh.reshape(len(mixture), -1, 3)
+    quats = np.roll(Rotation.from_matrix(axes).as_quat(), 1, axis=1) if len(new) else np.zeros((0, 4))
+    opacities = mixture.opacities[new].clip(1 - _CLOSED, _CLOSED)
     smallest = variances.max(1, keepdims=True) * 1e-12
-    columns = {
-        "means": mixture.means,
+    sh = mixture.sh[new].reshape(len(new), mixture.sh.shape[1] // 3, 3)
+    merged = {
+        "means": mixture.means[new],
         "quats": quats,
         "log_scales": np.log(np.maximum(variances, np.maximum(smallest, 1e-30))) / 2,
         "logit_opacities": np.log(opacities / (1 - opacities)),
         "sh0": sh[:, :1],
         "shN": sh[:, 1:],
     }
-    values = {name: torch.from_numpy(column.astype(np.float32)) for name, column in columns.items()}
-    rows = torch.from_numpy(np.flatnonzero(mixture.origin >= 0))
-    same = torch.from_numpy(mixture.origin[mixture.origin >= 0])
-    for name, value in values.items():
-        value[rows] = getattr(before, name)[same]
+    values, same = dict[str, torch.Tensor](), torch.from_numpy(np.maximum(mixture.origin, 0))
+    for name, column in merged.items():
+        values[name] = getattr(before, name)[same]
+        values[name][torch.from_numpy(new)] = torch.from_numpy(column.astype(np.float32))
     return Gaussians(**values, label_ids=torch.from_numpy(mixture.labels))
 
 
 def _merge_round(m: _Mixture, most: int) -> _Mixture | None:
     """Merge the cheapest pairs of neighbours, each Gaussian at most once and at most `most` pairs.
 
+    What merged stands where the first of the two stood: neighbours in space stay neighbours in memory.
     None where every category has one Gaussian left.
     """
     first, second = _neighbours(m.means, m.labels)
@@ -126,43 +131,44 @@ def _merge_round(m: _Mixture, most: int) -> _Mixture | None:
         return None
     rgb = sh0_to_rgb(torch.from_numpy(m.sh[:, :3])).numpy().astype(np.float64)
     cost = _costs(first, second, m.means, m.covs, m.opacities, rgb, m.mass, m.visible)
-    most = min(most, max(1, int(_ROUND * len(m))))
-    pairs = _cheapest(np.argsort(cost, kind="stable"), first, second, len(m), most)
+    pairs = _cheapest(cost, first, second, len(m), min(most, max(1, int(_ROUND * len(m)))))
     i, j = first[pairs], second[pairs]
+    del first, second, cost, rgb
     mass = m.mass[i] + m.mass[j]
     share = (m.mass[i] / mass)[:, None]
     apart = m.means[i] - m.means[j]
     spread = (apart[:, :, None] * apart[:, None]).reshape(-1, 9)[:, _UPPER]
     covs = share * m.covs[i] + (1 - share) * m.covs[j] + share * (1 - share) * spread
-    opacities = np.minimum(mass / np.maximum(_areas(covs), 1e-300), 1)
-    merged = replace(
-        m,
-        means=share * m.means[i] + (1 - share) * m.means[j],
-        covs=covs,
-        opacities=opacities,
-        sh=(share * m.sh[i] + (1 - share) * m.sh[j]).astype(np.float32),
-        labels=m.labels[i],
-        mass=mass,
-        visible=(m.visible[i] * m.mass[i] + m.visible[j] * m.mass[j]) / mass,
-        origin=np.full(len(i), -1),
-    )
-    alone = np.ones(len(m), bool)
-    alone[i] = alone[j] = False
-    row = np.empty(len(m), np.int64)
-    row[alone] = np.arange(alone.sum())
-    row[i] = row[j] = alone.sum() + np.arange(len(i))
-    names = ("means", "covs", "opacities", "sh", "labels", "mass", "visible", "origin")
-    columns = {name: np.concatenate([getattr(m, name)[alone], getattr(merged, name)]) for name in names}
+    narrow = share.astype(np.float32)
+    merged = {
+        "means": share * m.means[i] + (1 - share) * m.means[j],
+        "covs": covs,
+        "opacities": np.minimum(mass / np.maximum(_areas(covs), 1e-300), 1),
+        "sh": narrow * m.sh[i] + (1 - narrow) * m.sh[j],
+        "labels": m.labels[i],
+        "mass": mass,
+        "visible": (m.visible[i] * m.mass[i] + m.visible[j] * m.mass[j]) / mass,
+        "origin": -1,
+    }
+    kept = np.ones(len(m), bool)
+    kept[j] = False
+    row = np.cumsum(kept) - 1
+    row[j] = row[i]
+    columns = dict[str, Any]()
+    for name, values in merged.items():
+        columns[name] = getattr(m, name)[kept]
+        columns[name][row[i]] = values
     return _Mixture(**columns, into=row[m.into])
 
 
 def _neighbours(means: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of close rows of one label (int64 [P] each), every pair once."""
-    pairs = [np.zeros((2, 0), np.int64)]
+    pairs = [(np.zeros(0, np.int64),) * 2]
     for label in np.unique(labels):
         rows = np.flatnonzero(labels == label)
-        pairs.append(rows[np.stack(_neighbours_in(means[rows]))])
-    first, second = np.concatenate(pairs, axis=1)
+        first, second = _neighbours_in(means[rows])
+        pairs.append((first, second) if len(rows) == len(labels) else (rows[first], rows[second]))
+    first, second = (np.concatenate(some) for some in zip(*pairs, strict=True))
     return first, second
 
 
@@ -170,15 +176,10 @@ def _neighbours_in(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same among all rows: at least one pair of two rows or more."""
     n = len(means)
     near = np.asarray(KDTree(means).query(means, min(_NEIGHBOURS + 1, n), workers=-1)[1]).reshape(n, -1)
-    one = np.repeat(np.arange(n), near.shape[1])
-    other = near.ravel()
-    keys = np.sort(np.minimum(one, other) * n + np.maximum(one, other))
-    keys = keys[np.append(True, keys[1:] != keys[:-1])]  # several times as fast as np.unique
-    first, second = keys // n, keys % n
-    apart = first != second
-    if not apart.any():  # more than a neighbourhood of them in one place
+    first, second = _pairs(near.astype(np.int32))
+    if not len(first):  # more than a neighbourhood of them in one place
         return np.arange(n - 1), np.arange(1, n)
-    return first[apart], second[apart]
+    return first, second
 
 
 def _areas(covs: np.ndarray) -> np.ndarray:
@@ -187,18 +188,61 @@ def _areas(covs: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(a * d - b * b + a * f - c * c + d * f - e * e, 0))
 
 
+@njit(forceinline=True, cache=True)
+def _pair_of(near, i, j):  # type: ignore[no-untyped-def]
+    """Whether row i is the one to name its pair with j: of two that are near each other, the first is."""
+    if i < j:
+        return True
+    for other in near[j]:
+        if other == i:
+            return False
+    return i != j
+
+
+@njit(parallel=True, cache=True)
+def _pairs(near):  # type: ignore[no-untyped-def]
+    """The pairs of each row [n] and the rows near it, near [n, k]; every pair once, the lower row first."""
+    starts = np.zeros(len(near) + 1, np.int64)
+    for i in prange(len(near)):
+        for j in near[i]:
+            starts[i + 1] += _pair_of(near, i, j)
+    starts = np.cumsum(starts)
+    first, second = np.empty(starts[-1], np.int64), np.empty(starts[-1], np.int64)
+    for i in prange(len(near)):
+        at = starts[i]
+        for j in near[i]:
+            if _pair_of(near, i, j):
+                first[at], second[at] = min(i, j), max(i, j)
+                at += 1
+    return first, second
+
+
+def _cheapest(cost: np.ndarray, first: np.ndarray, second: np.ndarray, count: int, most: int) -> np.ndarray:
+    """Numbers of the pairs that merge, the cheapest first, at most `most` and no row of `count` twice."""
+    used, chosen, found = np.zeros(count, bool), np.empty(most, np.int64), 0
+    left = np.arange(len(cost))
+    while found < most and len(left):  # to sort some at a time saves what their mergers rule out
+        costs = cost[left]
+        cheap = costs <= np.quantile(costs[::_SAMPLED], min(_SORTED * most / len(left), 1), method="lower")
+        found = _choose(
+            left[cheap][np.argsort(costs[cheap], kind="stable")], first, second, used, chosen, found
+        )
+        left = left[~cheap]
+        left = left[~used[first[left]] & ~used[second[left]]]
+    return chosen[:found]
+
+
 @njit(cache=True)
-def _cheapest(order, first, second, count, most):  # type: ignore[no-untyped-def]
-    """Numbers of the pairs that merge, in the given order, without a row that has merged before."""
-    used, chosen, n = np.zeros(count, np.bool_), np.empty(most, np.int64), 0
+def _choose(order, first, second, used, chosen, n):  # type: ignore[no-untyped-def]
+    """Take pairs in the given order, without a row that is `used`, until `chosen` is full; how many are."""
     for pair in order:
-        if n == most:
+        if n == len(chosen):
             break
         if not used[first[pair]] and not used[second[pair]]:
             used[first[pair]] = used[second[pair]] = True
             chosen[n] = pair
             n += 1
-    return chosen[:n]
+    return n
 
 
 @njit(cache=True, fastmath=True)
@@ -208,10 +252,17 @@ def _area(c):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True)
-def _overlap(a, b, x, y, z, blur):  # type: ignore[no-untyped-def]
-    """Integral of the product of two Gaussians of height 1 at distance (x, y, z), over (2 pi)^1.5."""
-    one = _determinant(a[0] + blur, a[1], a[2], a[3] + blur, a[4], a[5] + blur)
-    other = _determinant(b[0] + blur, b[1], b[2], b[3] + blur, b[4], b[5] + blur)
+def _volume(c, blur):  # type: ignore[no-untyped-def]
+    """Root of the determinant of a covariance that is blurred."""
+    return np.sqrt(max(_determinant(c[0] + blur, c[1], c[2], c[3] + blur, c[4], c[5] + blur), 0.0))
+
+
+@njit(cache=True, fastmath=True)
+def _overlap(a, b, volumes, x, y, z, blur):  # type: ignore[no-untyped-def]
+    """Integral of the product of two Gaussians of height 1 at distance (x, y, z), over (2 pi)^1.5.
+
+    `volumes`: the product of their `_volume`.
+    """
     p, q, r = a[0] + b[0] + 2 * blur, a[1] + b[1], a[2] + b[2]
     s, t, u = a[3] + b[3] + 2 * blur, a[4] + b[4], a[5] + b[5] + 2 * blur
     both = _determinant(p, q, r, s, t, u)
@@ -220,7 +271,7 @@ def _overlap(a, b, x, y, z, blur):  # type: ignore[no-untyped-def]
     xx, yy, zz = s * u - t * t, p * u - r * r, p * s - q * q
     xy, xz, yz = r * t - q * u, q * t - r * s, q * r - p * t
     far = (xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)) / both
-    return np.sqrt(max(one, 0.0) * max(other, 0.0) / both) * np.exp(-0.5 * far)
+    return volumes / np.sqrt(both) * np.exp(-0.5 * far)
 
 
 @njit(cache=True, fastmath=True)
@@ -245,13 +296,12 @@ def _costs(first, second, means, covs, opacities, rgb, mass, visible):  # type: 
         area = _area(cov)
         opacity = min((mass[i] + mass[j]) / area, 1.0)
         blur, x, y, z = _BLUR * area, apart[0], apart[1], apart[2]
-        ii = _overlap(covs[i], covs[i], 0.0, 0.0, 0.0, blur)
-        jj = _overlap(covs[j], covs[j], 0.0, 0.0, 0.0, blur)
-        mm = _overlap(cov, cov, 0.0, 0.0, 0.0, blur)
-        ij = _overlap(covs[i], covs[j], x, y, z, blur)
+        size_i, size_j, size = _volume(covs[i], blur), _volume(covs[j], blur), _volume(cov, blur)
+        ii, jj, mm = size_i / _ITSELF, size_j / _ITSELF, size / _ITSELF
+        ij = _overlap(covs[i], covs[j], size_i * size_j, x, y, z, blur)
         to_i, to_j = 1 - share, share  # of the way from the one to the other lies the merged one
-        im = _overlap(covs[i], cov, to_i * x, to_i * y, to_i * z, blur)
-        jm = _overlap(covs[j], cov, to_j * x, to_j * y, to_j * z, blur)
+        im = _overlap(covs[i], cov, size_i * size, to_i * x, to_i * y, to_i * z, blur)
+        jm = _overlap(covs[j], cov, size_j * size, to_j * x, to_j * y, to_j * z, blur)
         change = 0.0
         for channel in range(4):
             one, other, weight = 1.0, 1.0, _OPACITY
