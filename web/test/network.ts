@@ -27,6 +27,7 @@ export interface Line {
 }
 
 const LATENCY = 100; // ms
+const DECODES = 1; // ms, of an increment: a few hundred splats, of 1 to 2 million a second, and two messages
 
 /** One point of a curve: ms since the start, bytes received, expected SSIM of the picture weighted by pixels. */
 export interface Sample {
@@ -63,7 +64,7 @@ function linkTo(documents: Documents, { mbit, connections }: Line) {
   const { fidelity } = manifest.promises;
   if (fidelity) put(fidelity.uri, documents.promises);
   putIncrements(network, manifest);
-  const renderer = new FakeRenderer(clock);
+  const renderer = new FakeRenderer(clock, DECODES);
   const replacing = cellsOf(manifest).flatMap(({ levels }) =>
     levels.flatMap((l, k) => (l.refine ? [k + 1] : [])),
   );
