@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
+from scipy.spatial.transform import Rotation
 
-from benchmarks.common import GARDEN, finish
+from benchmarks.adopt import SPLATS
+from benchmarks.common import finish
 from sagesplat.core.gaussians import Gaussians, concat
 from sagesplat.core.transform import transformed
 from sagesplat.formats.splats import read_splat, write_splat
 from sagesplat.run.recorded import stage_seconds
 from sagesplat.run.run_dir import RunDir
 
-SPLATS = GARDEN.parent.parent / "splats"
 GIVEN = (SPLATS / "playbot", SPLATS / "guitar.compressed.ply", SPLATS / "biker.compressed.ply")
 SIZES = (0.7, 1.4)  # of a copy; 1: 90 % of its Gaussians lie in a ball of radius 1
 
@@ -51,7 +52,9 @@ def cloud(splats: list[Gaussians], count: int, seed: int) -> Gaussians:
     rng, parts, left = np.random.default_rng(seed), [], count
     for g in cycle(_unit(g) for g in splats):
         taken = g if len(g) <= left else g.select(_some(rng, len(g), left))
-        parts.append(transformed(taken, _turn(rng), float(rng.uniform(*SIZES))))
+        parts.append(
+            transformed(taken, Rotation.random(random_state=rng).as_matrix(), float(rng.uniform(*SIZES)))
+        )
         left -= len(taken)
         if left == 0:
             break
@@ -68,13 +71,6 @@ def _unit(g: Gaussians) -> Gaussians:
     centre = np.median(xyz, 0)
     radius = float(np.quantile(np.linalg.norm(xyz - centre, axis=1), 0.9))
     return transformed(g, np.eye(3), 1 / radius, -centre / radius)
-
-
-def _turn(rng: np.random.Generator) -> np.ndarray:
-    """A rotation, drawn evenly."""
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q *= np.sign(np.diag(r))
-    return q * np.sign(np.linalg.det(q))
 
 
 def _some(rng: np.random.Generator, count: int, kept: int) -> torch.Tensor:

@@ -153,3 +153,11 @@ def test_the_cheapest_pairs_are_those_of_all_pairs_in_order(seed: int, count: in
                 used |= {first[pair], second[pair]}
                 wanted.append(pair)
         assert _cheapest(cost, first, second, count, most).tolist() == wanted
+
+
+def test_pairs_of_unknown_cost_come_last() -> None:
+    first, second = np.arange(0, 8, 2), np.arange(1, 9, 2)
+    cost = np.array([np.nan, 1.0, np.inf, 0.5])
+    assert _cheapest(cost, first, second, 8, 2).tolist() == [3, 1]
+    assert set(_cheapest(cost, first, second, 8, 4).tolist()) == {0, 1, 2, 3}
+    assert len(_cheapest(np.full(4, np.nan), first, second, 8, 4)) == 4

@@ -2,10 +2,12 @@
 
 export type Vec3 = [number, number, number];
 export type Whole = number;
-/** A SHA-256 in hexadecimal, or its first digits. */
+/** A SHA-256 in hexadecimal. */
 export type Sha256 = string;
 /** A path below the bundle's folder. */
 export type Path = string;
+/** A SHA-256 in hexadecimal, or its first digits. */
+export type Digits = string;
 /** Smallest x y z, largest x y z. */
 export type Box = [number, number, number, number, number, number];
 /** A range of a coded stream, of which a cell has one, and a file those of a label; or SPZ version 3; or a binary PLY in INRIA's layout, its y and z opposite to the bundle's. */
@@ -108,7 +110,7 @@ export interface Palette {
   uri: Path;
   offset: 0;
   bytes: Whole;
-  sha256: Sha256;
+  sha256: Digits;
 }
 /** A compact part of a label, with levels of its own. */
 export interface Cell {
@@ -136,7 +138,7 @@ export interface Level {
   bytes: number;
   gpuBytes: number;
   count: number;
-  sha256: Sha256;
+  sha256: Digits;
 }
 /** Quality by level whatever the viewpoint, until the viewpoint models are there. */
 export interface LabelQuality {

@@ -27,7 +27,7 @@ export interface Line {
 }
 
 const LATENCY = 100; // ms
-const DECODES = 1; // ms, of an increment: a few hundred splats, of 1 to 2 million a second, and two messages
+const DECODES = 1; // ms, of an increment, assumed: some hundred splats of 1 to 2 million a second, and two messages
 
 /** One point of a curve: ms since the start, bytes received, expected SSIM of the picture weighted by pixels. */
 export interface Sample {

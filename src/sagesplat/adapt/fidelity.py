@@ -28,6 +28,7 @@ from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 
 _KEEP = 2 * 10**8  # bytes of the full model's pictures that are kept
+_SEEN_BYTES = 44  # of a Gaussian in what its levels are rendered from
 _KEEP_LEVELS = 10**8  # of what levels are rendered from: for many Gaussians it takes as much as 20 pictures
 PROMISED_SHARE = 2e-3  # of a picture that a category has to cover: of fewer pixels nothing is promised
 
@@ -228,7 +229,9 @@ class References:
 
         `compositions`: those that will be compared; None: any. Levels that can be kept serve for any.
         """
-        if isinstance(self._ladder, PrefixLadder) and self._left_levels >= 44 * len(self._ladder.gaussians):
+        if isinstance(self._ladder, PrefixLadder) and self._left_levels >= _SEEN_BYTES * len(
+            self._ladder.gaussians
+        ):
             compositions = None
         key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
         kept = self._kept.get(key)

@@ -37,4 +37,3 @@ CategoryId = Annotated[int, Meta(ge=0, le=2**15 - 1)]
 
 Text = Annotated[str, Meta(max_length=4096)]
 Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
-FirstDigits = Annotated[str, Meta(pattern=r"^[0-9a-f]{16,64}\Z")]  # of one, or all

@@ -20,7 +20,7 @@ import torch
 
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians, concat
-from sagesplat.core.limits import AtLeast1, Count, FirstDigits, LabelId, Share
+from sagesplat.core.limits import AtLeast1, Count, LabelId, Sha256, Share
 from sagesplat.core.names import slugs
 from sagesplat.formats.levels import starts_of
 from sagesplat.formats.ply import put_ply, read_ply
@@ -54,7 +54,7 @@ class Increment:
     count: AtLeast1  # Gaussians
     nbytes: AtLeast1
     gpu_bytes: AtLeast1
-    sha256: FirstDigits
+    sha256: Sha256
     refine: Refine = "ADD"  # REPLACE: instead of all increments of lower levels
     offset: Count = 0  # its first byte in the file, which has all coded streams of a category
     weight: Share | None = None  # of second opacities where this is the newest level; None: there are none

@@ -47,7 +47,8 @@ from sagesplat.viewer.promises import Seen
 from sagesplat.viewer.single_file import check_page, write_single_file
 
 _POSTER_HEIGHT = 360  # px
-_LOOKS = 2.0  # pixels a side, of the photos', of what fidelities look like
+_LOOKS = 840  # px, longer side of a view, of which a third shows what fidelities look like
+_MOST_LOOKS = 2.0  # times the photos' pixels: larger ones show nothing more
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,8 @@ def _poster(g: Gaussians, contents: Contents) -> bytes:
 
 def _looks(job: Job) -> tuple[Sequence[float], bytes] | None:
     """The fidelities of the run's plans and 1, and a JPEG of a part of a view at each, side by side."""
-    shown = looks(job, _LOOKS)
+    side = max(max(view.camera.width, view.camera.height) for view in job.scene.views)
+    shown = looks(job, min(_MOST_LOOKS, _LOOKS / side))
     if not shown:
         return None
     return [look.asked for look in shown], _jpeg(np.concatenate([look.image for look in shown], axis=1), 85)

@@ -8,10 +8,7 @@ import warnings
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16
-from numba import prange
-from scipy.cluster.vq import kmeans2
-
-from sagesplat.kernels.jit import njit
+from scipy.cluster.vq import kmeans2, vq
 
 MOST = 64  # cells of a scene that is split automatically
 FEWEST = 300  # Gaussians of a cell, about, at least
@@ -84,19 +81,4 @@ def _nearest_centres(
     some = counted[np.linspace(0, len(counted) - 1, min(len(counted), _SAMPLE)).astype(int)]
     parts = min(parts, len(np.unique(some, axis=0)))  # equal places are no two centres
     centres, _ = k_means(some, parts)
-    return _nearest(places, centres)
-
-
-@njit(parallel=True, cache=True)
-def _nearest(places, centres):  # type: ignore[no-untyped-def]
-    """The centre that is nearest to each place; int64 [n]."""
-    found = np.zeros(len(places), np.int64)
-    for row in prange(len(places)):
-        least = np.inf
-        for number in range(len(centres)):
-            x, y = places[row, 0] - centres[number, 0], places[row, 1] - centres[number, 1]
-            z = places[row, 2] - centres[number, 2]
-            square = x * x + y * y + z * z
-            if square < least:
-                least, found[row] = square, number
-    return found
+    return vq(places, centres, check_finite=False)[0]

@@ -221,6 +221,7 @@ def _cheapest(cost: np.ndarray, first: np.ndarray, second: np.ndarray, count: in
     """Numbers of the pairs that merge, the cheapest first, at most `most` and no row of `count` twice."""
     used, chosen, found = np.zeros(count, bool), np.empty(most, np.int64), 0
     left = np.arange(len(cost))
+    cost = np.where(np.isnan(cost), np.inf, cost)  # of the hugest: last, and never below a quantile otherwise
     while found < most and len(left):  # to sort some at a time saves what their mergers rule out
         costs = cost[left]
         cheap = costs <= np.quantile(costs[::_SAMPLED], min(_SORTED * most / len(left), 1), method="lower")

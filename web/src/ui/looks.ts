@@ -9,6 +9,7 @@ export class Looks {
   readonly element: HTMLElement;
   readonly #name = h("small");
   readonly #parts = [h("i"), h("i")] as const;
+  #asked = false;
 
   constructor(
     readonly viewer: Viewer,
@@ -25,6 +26,8 @@ export class Looks {
 
   /** Fetches the picture. Without it the words beside the slider stay alone. */
   async show(): Promise<void> {
+    if (this.#asked) return;
+    this.#asked = true;
     try {
       const content = await bytesFrom(this.viewer.source, this.looks.uri);
       const picture = new Image();
@@ -44,18 +47,12 @@ export class Looks {
   update({ quality, target }: Settings): void {
     const { targets } = this.looks;
     const last = targets.length - 1;
-    const nearest = nearestOf(targets.slice(0, last), target);
-    setText(this.#name, formatSsim(targets[nearest] ?? 1));
-    this.element.classList.toggle("other", quality !== "fidelity");
-    [nearest, last].forEach((place, i) => {
+    const below = targets.findLastIndex((one, place) => place < last && one <= target); // nothing better is shown
+    setText(this.#name, formatSsim(targets[below] ?? 1));
+    this.element.classList.toggle("other", quality !== "fidelity" || below < 0);
+    [below, last].forEach((place, i) => {
       const part = this.#parts[i];
       if (part) part.style.backgroundPositionX = `${(100 * place) / last}%`;
     });
   }
-}
-
-/** The place of the value that is nearest. */
-function nearestOf(values: readonly number[], wanted: number): number {
-  const far = values.map((value) => Math.abs(value - wanted));
-  return far.indexOf(Math.min(...far));
 }

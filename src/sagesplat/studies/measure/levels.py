@@ -13,7 +13,7 @@ from msgspec import Meta
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import NO_OFFSET, Position
-from sagesplat.core.limits import AtLeast1, Count, FirstDigits, LabelId, Share
+from sagesplat.core.limits import AtLeast1, Count, LabelId, Share
 from sagesplat.core.names import repaired
 from sagesplat.formats.increments import INDEX, Increment, Refine, read_increments, read_index, shown
 from sagesplat.formats.lod_meta import LOD_META, level_files
@@ -106,7 +106,7 @@ class _BundleLevel:
     count: AtLeast1
     bytes: AtLeast1
     gpuBytes: AtLeast1
-    sha256: FirstDigits
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{16,64}\Z")]
     refine: Refine = "ADD"
     offset: Count = 0
     weight: Share | None = None
@@ -114,9 +114,8 @@ class _BundleLevel:
     def increment(self, label_id: int, cell: int, number: int) -> Increment:
         uri = self.uri.removeprefix("chunks/")
         sizes = self.count, self.bytes, self.gpuBytes
-        return Increment(
-            label_id, cell, number, uri, *sizes, self.sha256, self.refine, self.offset, self.weight
-        )
+        digits = self.sha256.ljust(64, "0")  # a manifest has the first; nothing here compares them
+        return Increment(label_id, cell, number, uri, *sizes, digits, self.refine, self.offset, self.weight)
 
 
 @dataclass(frozen=True)
