@@ -15,7 +15,7 @@ composition (`levels`: by cell, from 1) and its bound, to 1e-5 (null: NaN).
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -234,12 +234,12 @@ def cameras_at(made: ViewModel) -> list[Camera]:
     return cameras
 
 
-def _ssim_case(name: str, made: ViewModel, seed: int) -> Case:
+def _ssim_case(name: str, made: ViewModel, seed: int, stored: Mapping[str, Case]) -> Case:
     rng = np.random.default_rng(seed)
     n = made.num_views
     seen = Seen(rng.uniform(0, 0.3, n), np.full(n, np.nan), rng.normal(0, 0.2, n))
     document = ssim_document({made.label_id: made}, cameras_at(made), {made.label_id: seen})
-    sent = read_model(document, made.label_id)
+    sent = read_model(stored.get(name, document), made.label_id)
     position, direction = rng.normal(0, 3, (6, 3)), rng.normal(size=(6, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     for i in (0, 2, 3):  # a known view, and viewpoints beside it: the support is large enough
@@ -274,7 +274,9 @@ def drawn_cameras(seed: int, count: int) -> list[Camera]:
     return cameras
 
 
-def fidelity_case(name: str, labels: Sequence[int], views: int, levels: int, seed: int) -> Case:
+def fidelity_case(
+    name: str, labels: Sequence[int], views: int, levels: int, seed: int, stored: Mapping[str, Case]
+) -> Case:
     """A case of fidelity; every fifth cell has one file less."""
     cells, cameras = make_cells(seed, labels, 2.5), drawn_cameras(seed, views)
     models = fidelity_models(cells, cameras, levels, seed)
@@ -282,7 +284,7 @@ def fidelity_case(name: str, labels: Sequence[int], views: int, levels: int, see
     cost = costs_of([Ladder([1000 + 10 * c] * len(files[c])) for c in cells.ids.tolist()])
     document = fidelity_document(models, files, levels, cells, cost, cameras)
     there = [*cameras[:3], *drawn_cameras(seed + 1, 4), posed((900.0, 0, 0), AHEAD)]
-    sent = read_fidelity(document)
+    sent = read_fidelity(stored.get(name, document))
     expected = expect(sent, cells, there, cost.shape[1])
     rng = np.random.default_rng(seed)
     composed = 1 + (
@@ -319,20 +321,21 @@ def fidelity_case(name: str, labels: Sequence[int], views: int, levels: int, see
     return {"name": name, "labels": listed, "promises": document, "viewpoints": points}
 
 
-def promise_cases() -> list[Case]:
-    """All cases of promises.json, in the frame of a bundle."""
+def promise_cases(stored: Mapping[str, Case] | None = None) -> list[Case]:
+    """All cases of promises.json, in the frame of a bundle; predicted from `stored` documents if any."""
+    known = stored or {}
     nothing = replace(model(2, 6, [1, 2, 3]), calibration=NO_CALIBRATION)
     steep = replace(model(5, 20, [1, 2, 3]), calibration=_with_slopes([0.6, -0.4, 0.2, 0.3, 0.05, -0.1]))
     return [
-        _ssim_case("one view, one level", model(1, 1, [1]), 1),
-        _ssim_case("curves of three kinds", model(2, 6, [1, 2, 3]), 2),
-        _ssim_case("levels without a promise", model(3, 9, [2, 3, 5]), 3),
-        _ssim_case("no view unseen", model(4, 12, [1, 2, 3, 4], unseen=False), 4),
-        _ssim_case("no target that can be kept", nothing, 8),
-        _ssim_case("thresholds that overtake each other", steep, 9),
-        fidelity_case("fidelity, a cell", [7], 3, 2, 11),
-        fidelity_case("fidelity, cells of a label", [7] * 5, 16, 4, 12),
-        fidelity_case("fidelity, cells of labels", [3, 3, 7, 7, 7, 7, 9, 9], 20, 5, 13),
+        _ssim_case("one view, one level", model(1, 1, [1]), 1, known),
+        _ssim_case("curves of three kinds", model(2, 6, [1, 2, 3]), 2, known),
+        _ssim_case("levels without a promise", model(3, 9, [2, 3, 5]), 3, known),
+        _ssim_case("no view unseen", model(4, 12, [1, 2, 3, 4], unseen=False), 4, known),
+        _ssim_case("no target that can be kept", nothing, 8, known),
+        _ssim_case("thresholds that overtake each other", steep, 9, known),
+        fidelity_case("fidelity, a cell", [7], 3, 2, 11, known),
+        fidelity_case("fidelity, cells of a label", [7] * 5, 16, 4, 12, known),
+        fidelity_case("fidelity, cells of labels", [3, 3, 7, 7, 7, 7, 9, 9], 20, 5, 13, known),
     ]
 
 
