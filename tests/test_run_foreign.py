@@ -189,7 +189,7 @@ def agree(run: Path) -> None:
         path = RunDir(run).provenance(stage)
         try:
             record = read_json(path)
-            names = [name for name in record["inputs"] if (run / name).exists()]
+            names = [name for name in record["inputs"] if (run / name).is_file()]  # "/" would be read whole
             record["inputs"] |= records.input_hashes(RunDir(run), [run / name for name in names])
             write_json(path, record)
         except (SageError, TypeError, KeyError, UnicodeError):
