@@ -52,9 +52,7 @@ def cloud(splats: list[Gaussians], count: int, seed: int) -> Gaussians:
     rng, parts, left = np.random.default_rng(seed), [], count
     for g in cycle(_unit(g) for g in splats):
         taken = g if len(g) <= left else g.select(_some(rng, len(g), left))
-        parts.append(
-            transformed(taken, Rotation.random(random_state=rng).as_matrix(), float(rng.uniform(*SIZES)))
-        )
+        parts.append(transformed(taken, Rotation.random(None, rng).as_matrix(), float(rng.uniform(*SIZES))))
         left -= len(taken)
         if left == 0:
             break

@@ -138,7 +138,7 @@ def training_workspace(scene: Scene, folder: Path) -> Scene:
 def compared(found: Mapping[str, Sequence[Course]], psnr: float | None) -> dict[str, Any]:
     """The figures of both, and what OpenSplat's are over ours; null where a PSNR was not reached."""
     best = [max(course.psnr.values()) for courses in found.values() for course in courses]
-    psnr = np.floor(2 * min(best)) / 2 if psnr is None else psnr
+    psnr = float(np.floor(2 * min(best)) / 2) if psnr is None else psnr
     rows: dict[str, Any] = {}
     for name, courses in found.items():
         times = [course.seconds_to(psnr) for course in courses]
@@ -156,7 +156,7 @@ def compared(found: Mapping[str, Sequence[Course]], psnr: float | None) -> dict[
         "step": theirs["step_ms"] / own["step_ms"],
         "seconds_to_psnr": None if None in times else times[0] / times[1],
     }
-    return {"psnr": float(psnr), **rows, "ratio": ratio}
+    return {"psnr": psnr, **rows, "ratio": ratio}
 
 
 @dataclass(frozen=True)

@@ -139,7 +139,8 @@ def measure(
         for lod, level in enumerate(levels):
             g = job.ladder.load(level)
             wanted = [ours(g, camera, job.antialiased) for camera in cameras]
-            for engine, kind in [(one, kind) for one in engines for kind in FORMATS[one]]:
+            pairs: list[tuple[Engine, str]] = [(one, kind) for one in engines for kind in FORMATS[one]]
+            for engine, kind in pairs:
                 if kind == ".splat" and bool(g.shN.any()):
                     continue  # it holds no harmonics
                 file = streamed if kind == LOD_META else folder / f"{engine}-{level}{kind}"
@@ -175,7 +176,9 @@ def main(
         write: keep the figures in benchmarks/results/cpu.
     """
     given: dict[Engine, Path | None] = {"playcanvas": playcanvas, "spark": spark}
-    engines = {engine: path for engine, path in given.items() if path and (path / PACKAGES[engine]).is_dir()}
+    engines: dict[Engine, Path] = {
+        engine: path for engine, path in given.items() if path and (path / PACKAGES[engine]).is_dir()
+    }
     rows = []
     folder = Path(tempfile.mkdtemp())
     try:

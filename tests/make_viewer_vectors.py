@@ -312,7 +312,7 @@ def fidelity_case(
         for i, camera in enumerate(there)
     ]
     listed = [
-        {"id": label, "cells": [placed(cells, row) for row in np.flatnonzero(cells.labels == label)]}
+        {"id": label, "cells": [placed(cells, row) for row in np.flatnonzero(cells.labels == label).tolist()]}
         for label in np.unique(cells.labels).tolist()
     ]
     for label in listed:

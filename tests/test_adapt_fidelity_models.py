@@ -176,7 +176,7 @@ def test_viewpoints_off_the_path_that_need_more_get_more():
         asked = [model.calibration.needed(target, np.array([place]))[0] for place in (0.0, 0.6)]
         needs = [before.needed(target, away[:1])[0], before.needed(target + 0.04, away[-1:])[0]]
         np.testing.assert_allclose(asked, needs, atol=0.01)
-    few = Trial(*[part[15:] if isinstance(part, np.ndarray) else part for part in vars(found).values()])
+    few = replace(found, **{name: part[15:] for name, part in vars(found).items() if name != "labels"})
     (model,) = remove_composition_bias({3: models[3]}, few, 0.95).values()
     at_photo, same = (
         one.needed(0.8 + more, away[:1])[0] for one, more in ((model.calibration, 0), (before, 0.04))

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sagesplat.adapt.bound_plans import Costs, pooled
 from sagesplat.adapt.scene_plans import never_dearer, plan_for_scene, raise_failing_levels, reached
+from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.core.errors import RunError
 
 quick = settings(max_examples=80)
@@ -52,9 +53,10 @@ def test_the_cheapest_level_that_the_share_of_views_needs(views, target, share, 
 
 def test_a_lower_target_costs_no_more_than_a_higher_one():
     """Raising levels may go further for a lower target than planning by cell does for a higher one."""
+    targets: list[tuple[float, QualityKind]] = [(0.25, "fidelity"), (0.35, "fidelity"), (0.9, "ssim")]
     low, high, ssim = (
         plan_for_scene(draws(60, 2, 5, 0), np.zeros((60, 2)), costs(2, 5), target, 0.95, kind)
-        for target, kind in ((0.25, "fidelity"), (0.35, "fidelity"), (0.9, "ssim"))
+        for target, kind in targets
     )
     assert never_dearer([low, high, ssim]) == [low, high, ssim]
     full = plan_for_scene(draws(60, 2, 5, 0), np.zeros((60, 2)), costs(2, 5), 1.0, 0.95, "fidelity")

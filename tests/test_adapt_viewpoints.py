@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -127,7 +128,7 @@ def test_screens_are_log_uniform_and_keep_the_field_of_view_or_the_area():
     np.testing.assert_allclose(np.quantile(np.log2(s), [0.1, 0.5, 0.9]), [-0.8, 0, 0.8], atol=0.12)
     size = np.array([(camera.width, camera.height) for camera in drawn])
     own = np.array([cameras[0].width, cameras[0].height])
-    kept = (np.abs(size - s[:, None] * own) <= 0.5 + 1e-4).all(1)
+    kept = np.abs(size - s[:, None] * own).max(1) <= 0.5 + 1e-4
     assert 0.4 < kept.mean() < 0.65
     np.testing.assert_allclose(size.prod(1), s**2 * own.prod(), rtol=0.12)
     assert (size[:, 0] < size[:, 1]).mean() > 0.15  # portrait
@@ -143,7 +144,7 @@ def test_places_are_on_the_path_among_the_cameras_and_behind_them():
     base = capture_cameras(where)
     positions = np.stack([camera.position for camera in base])
 
-    def drawn(*places: float) -> list[Camera]:
+    def drawn(*places: Any) -> list[Camera]:
         return list(draw(where, base, Rule(places=places), {"fit": 100}).cameras)
 
     up = poses(base)[:, 1, :3].mean(0)

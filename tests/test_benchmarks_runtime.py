@@ -107,9 +107,8 @@ def test_spark_draws_opacities_above_1_as_many_layers(power):
 def test_spark_filters_opacities_before_it_draws_them():
     small = one_splat()
     small.log_scales.fill_(math.log(0.02))
-    how = {"backend": "cpu"}
-    expected = render_rgb(small, EYE, antialiased=True, **how)
-    drawn = render_rgb(spark.wide(small, np.ones(1), EYE, True), EYE, antialiased=False, **how)
+    expected = render_rgb(small, EYE, antialiased=True, backend="cpu")
+    drawn = render_rgb(spark.wide(small, np.ones(1), EYE, True), EYE, antialiased=False, backend="cpu")
     assert 0 < expected.max() < 0.5
     np.testing.assert_allclose(drawn, expected, atol=1e-4)
 

@@ -1,6 +1,7 @@
 """The Gaussians type: rows stay together."""
 
 from dataclasses import fields
+from typing import Any
 
 import pytest
 import torch
@@ -64,7 +65,7 @@ def test_detach_shares_memory_without_a_graph():
         assert p.data_ptr() == leaves[name].data_ptr()
 
 
-def trained(g: Gaussians) -> torch.nn.ParameterDict:
+def trained(g: Gaussians) -> Any:
     return torch.nn.ParameterDict({name: torch.nn.Parameter(t) for name, t in g.to_gsplat().items()})
 
 
@@ -118,6 +119,6 @@ def test_what_is_no_3dgs_is_one_line():
         ({"sh0": None}, r"splats: no tensors sh0; give gsplat's means"),
     ):
         with pytest.raises(DataError, match=says):
-            Gaussians.from_gsplat({**g.to_gsplat(), **change})
+            Gaussians.from_gsplat({**g.to_gsplat(), **change})  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match="no tensors means, quats, scales, opacities, sh0, shN"):
         Gaussians.from_gsplat({})

@@ -46,7 +46,7 @@ def pair(height: int, width: int, noise: float, seed: int = 0) -> tuple[np.ndarr
 @pytest.mark.parametrize(
     ("size", "scales"), [((176, 200), 5), ((181, 207), 5), ((175, 300), 4), ((64, 48), 3), ((11, 40), 1)]
 )
-def test_agrees_with_the_definition(size, scales, noise):
+def test_agrees_with_the_definition(size: tuple[int, int], scales, noise):
     x, y = pair(*size, noise)
     assert num_scales(*size) == scales
     assert ms_ssim(x, y) == pytest.approx(plain(x, y, scales), abs=2e-5)

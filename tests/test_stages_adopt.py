@@ -317,7 +317,7 @@ def test_networks_segment_the_renders_and_their_label_images_vote(
     factory = replace(SEGMENTERS[kind], load=lambda *_: _Halves(), settings=lambda config: {})
     monkeypatch.setitem(SEGMENTERS, kind, factory)
     write_ply(tmp_path / "ball.ply", _ball(labels=False))
-    masks = MasksConfig(segmenter=kind, prompts="car" if kind == "text" else None)
+    masks = MasksConfig(segmenter=kind, prompts="car" if kind == "text" else "")
     job = Job(RunDir(tmp_path / "run"), lambda event: None, "cpu")
     open_splat(job, tmp_path / "ball.ply", SMALL, SceneConfig(), masks, LabelsConfig())
     assert job.load_last_level().counts().keys() >= {3, 184}

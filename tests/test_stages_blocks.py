@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -242,11 +243,12 @@ def test_the_interior_of_a_block_keeps_order_and_levels(tmp_path: Path) -> None:
     assert own.second is not None
     assert whole.second is not None
     assert own.second.weights == {cell: whole.second.weights[cell] for cell in own.sizes}
-    for more, message in (
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({}, "no labels in it"),
         ({"labels": [3, 184]}, "not the labels of 3"),
         ({"labels": [3, 3, 40_000]}, "not the labels"),
-    ):
+    )
+    for more, message in cases:
         write_set(tmp_path / "other.npz", own.gaussians, 5, own.sizes, **more)
         with pytest.raises(DataError, match=message):
             boundaries.read_block(tmp_path / "other.npz")

@@ -30,6 +30,7 @@ class Stub(methods.NestedLevels):
         self.asked += 1
         measured = np.full((VIEWS, len(plans), 2), 0.95)
         for j, plan in enumerate(plans):
+            assert plan.cells is not None
             if min(plan.cells[0], plan.cells[1]) < self.enough:
                 measured[:, j, 1] = 0.85
         return measured

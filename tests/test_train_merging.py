@@ -149,8 +149,8 @@ def test_the_cheapest_pairs_are_those_of_all_pairs_in_order(seed: int, count: in
     for most in (1, count // 3 + 1, count):
         used, wanted = set[int](), list[int]()
         for pair in np.argsort(cost, kind="stable").tolist():
-            if len(wanted) < most and not used & {first[pair], second[pair]}:
-                used |= {first[pair], second[pair]}
+            if len(wanted) < most and not used & {int(first[pair]), int(second[pair])}:
+                used |= {int(first[pair]), int(second[pair])}
                 wanted.append(pair)
         assert _cheapest(cost, first, second, count, most).tolist() == wanted
 

@@ -50,6 +50,7 @@ POLICY = (
 )
 NAMES = {1: "brick", 2: "grass-merged", 3: "sky-other-merged"}
 COLOURS = {1: (0.8, 0.2, 0.1), 2: (0.1, 0.7, 0.2), 3: (0.15, 0.25, 0.85)}
+LENGTHS = (2.0, 2.0, 2.0, 2.0)  # of the models
 SIZES = dict.fromkeys(COLOURS, (20, 50, 100, 200))  # splats up to each level
 LABEL_OF = dict(zip(COLOURS, COLOURS, strict=True))  # of the cells
 WHOLE = sum(size[-1] for size in SIZES.values())
@@ -170,7 +171,7 @@ def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def ssim(label: int) -> ViewModel:
         made = model(label, len(cameras), [1, 2, 3, 4], unseen=False)
         return replace(
-            made, label_id=label, inputs=views, extent=1.0, focal=camera().focal, lengths=(2.0,) * 4,
+            made, label_id=label, inputs=views, extent=1.0, focal=camera().focal, lengths=LENGTHS,
             weights=made.weights * 0, calibration=usual(label, "ssim"),
         )  # fmt: skip
 
@@ -181,7 +182,7 @@ def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
             np.zeros((4, 0)), np.full(len(views), -1.0),
         )  # fmt: skip
         return FidelityModel(
-            label, 1.0, camera().focal, SCREENS, views[:, :7], (2.0,) * 4, views[:, :6].T, (cell,), 0.0,
+            label, 1.0, camera().focal, SCREENS, views[:, :7], LENGTHS, views[:, :6].T, (cell,), 0.0,
             usual(label, "fidelity"),
         )  # fmt: skip
 

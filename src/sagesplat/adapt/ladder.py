@@ -179,9 +179,13 @@ class NestedLadder(Ladder):
         """1 to K."""
         return self.cells.levels
 
-    @cached_property
+    @property
     def counts(self) -> dict[tuple[int, int], int]:
         """Gaussians of each (label id, level)."""
+        return self._counts
+
+    @cached_property
+    def _counts(self) -> dict[tuple[int, int], int]:
         found: dict[tuple[int, int], int] = {}
         for (cell, level), count in self.cells.counts.items():
             key = self.label_of[cell], level

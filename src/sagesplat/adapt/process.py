@@ -161,7 +161,7 @@ def _hyperparameters(parts: Sequence[_Part]) -> np.ndarray:
 def _cost(theta: np.ndarray, parts: Sequence[_Part]) -> tuple[float, np.ndarray]:
     """Negative log of the marginal likelihood, mean over levels, times the prior; and its derivatives."""
     z = (theta - PRIOR) / PRIOR_WIDTH
-    value, slope = z @ z / 2, z / PRIOR_WIDTH
+    value, slope = float(z @ z) / 2, z / PRIOR_WIDTH
     for squares, u, values in parts:
         S, slopes = _terms(squares, u, theta)
         inverse, log_determinant = _inverse(S)

@@ -16,8 +16,8 @@ Config = TypeVar("Config")
 def recorded_ladder(path: Path) -> config.LadderKind:
     """The kind of levels that a run has results of: nested ones, unless there are only others."""
     kinds: tuple[config.LadderKind, ...] = get_args(config.LadderKind)
-    made = [kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()]
-    return made[0] if len(made) == 1 else "nested"
+    made = {kind for kind in kinds if (RunDir(path, kind).adapted / "provenance").is_dir()}
+    return "snapshots" if made == {"snapshots"} else "nested"
 
 
 def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:

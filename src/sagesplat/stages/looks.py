@@ -69,7 +69,7 @@ def _furthest(difference: np.ndarray) -> tuple[float, tuple[slice, ...]]:
     inside = tuple(
         slice(at, full - side + at + 1) for at, side, full in zip(first, size, difference.shape, strict=True)
     )
-    means = uniform_filter(difference.astype(np.float64), size)[inside]
+    means = uniform_filter(difference.astype(np.float64), size)[inside]  # pyright: ignore[reportArgumentType]
     corner = np.unravel_index(int(means.argmax()), means.shape)
     part = tuple(slice(int(at), int(at) + side) for at, side in zip(corner, size, strict=True))
     return float(means.max()), part

@@ -287,18 +287,18 @@ class NestedLevels(Method):
 
     def plan_budget(self, config: PlanConfig) -> Plan:
         """See `Method`."""
-        job, asked = self.job, (config.budget, config.budget_unit)
+        job, budget, unit = self.job, config.budget, config.budget_unit
         weights = {label_named(job, name): weight for name, weight in config.weights.items()}
         if config.quality == "ssim":
             train = job.scene.train_ids
             mean, pixels = pooled(self.qualities["ssim"].mean[train], self.shown[train])
             weight = pixels * [weights.get(label, 1.0) for label in self.costs.labels]
-            return plan_within(mean, self.costs, *asked, weight, config.quality)
+            return plan_within(mean, self.costs, budget, unit, weight, config.quality)
         found, label_of = sampled_of(job), job.cells.label_of
         known = found.pixels * (job.cells.labels != UNLABELLED)
         mean, pixels = pooled(found.fidelity.astype(np.float64), known.astype(np.float64))
         weight = pixels * [weights.get(label, 1.0) for label in job.cells.labels.tolist()]
-        plan = plan_within(mean, self.cell_costs, *asked, weight, config.quality)
+        plan = plan_within(mean, self.cell_costs, budget, unit, weight, config.quality)
         return by_label(plan, label_of, pixels)
 
     def amount(self, plan: Plan) -> str:

@@ -40,6 +40,7 @@ def split_cells(
     inside = np.ones(len(means), bool) if inside is None else inside
     total = max(int(inside.sum()), 1)
     cells, label_of = np.empty(len(means), np.int16), dict[int, int]()
+    label: int
     for number, label in enumerate(labels.tolist()):
         rows = np.flatnonzero(column == number)
         counted = rows[inside[rows]]
@@ -57,7 +58,7 @@ def k_means(
     """Centres, some of which may be nearest to none of the places, and the nearest one to each place."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of such centres
-        centres, nearest = kmeans2(places, parts, seed=0, minit="++", missing="warn")
+        centres, nearest = kmeans2(places, parts, minit="++", missing="warn", seed=0)  # pyright: ignore[reportCallIssue]
     return centres, nearest
 
 

@@ -76,6 +76,7 @@ def fit_to_renders(
     first = {name: torch.zeros_like(value) for name, value in values.items()}
     second = {name: torch.zeros_like(value) for name, value in values.items()}
     order, workspace, steps = np.random.default_rng(0), Workspace(), passes * len(cameras)
+    rows = np.zeros(0, np.int64)
     for step in range(steps):
         if step % len(cameras) == 0:
             rows = order.permutation(len(cameras))
