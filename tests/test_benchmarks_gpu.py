@@ -45,7 +45,7 @@ def test_a_trial_of_the_whole_script(tmp_path, capsys):
         ["agreement", "ok"], ["full", "ok"], ["race", "ok"], ["split", "ok"], ["multi", "skipped"],
     ]  # fmt: skip
     race = figures["race"]["figures"]
-    assert (set(race["runs"]), set(race["missed"])) == ({"ours"}, {"gsplat", "mcmc", "large"})
+    assert (set(race["runs"]), set(race["missed"])) == ({"ours", "ours-mcmc"}, {"gsplat", "mcmc", "large"})
     assert set(figures["split"]["figures"]["kernels"]) == {*(name for name, _ in split.KERNELS), "rest"}
 
 

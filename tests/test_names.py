@@ -78,7 +78,9 @@ def test_a_run_with_awkward_names(
     assert labels.keys() - {"unlabelled"} == set(KEPT.values())
     assert labels["\u00e9"]["always"]
     assert labels["[/red]"]["weight"] == 2
-    uris = [{level["uri"] for level in label["levels"]} for label in manifest["labels"]]
+    uris = [
+        {level["uri"] for cell in label["cells"] for level in cell["levels"]} for label in manifest["labels"]
+    ]
     assert len(set().union(*uris)) == sum(map(len, uris))  # no category has a file of another one
     assert all(re.fullmatch(r"chunks/[a-z0-9-]+-[0-9a-f]{12}\.sgst", uri) for some in uris for uri in some)
 

@@ -47,6 +47,7 @@ Status = Literal[
     "uncalibrated",  # too few calibration views for that: widened, but nothing is proven
 ]
 STATUSES: tuple[Status, ...] = get_args(Status)
+_LARGEST_THRESHOLD = 1e6  # a bundle has them in whole steps
 
 
 class Prediction(NamedTuple):
@@ -280,5 +281,7 @@ def check_parts(calibration: Calibration, screens: tuple[float, float], *numbers
         raise ValueError("targets out of range")
     if not screens[0] <= screens[1]:
         raise ValueError("screens out of order")
-    if not all((np.abs(array) < LARGEST).all() for array in (*numbers, thresholds, slopes)):
+    if not all((np.abs(array) <= _LARGEST_THRESHOLD).all() for array in (thresholds, slopes)):
+        raise ValueError("thresholds or slopes out of range")
+    if not all((np.abs(array) < LARGEST).all() for array in numbers):
         raise ValueError("numbers out of range")

@@ -20,7 +20,7 @@ from sagesplat.adapt.ladder import (
 )
 from sagesplat.adapt.observe import PERCENTILE, distances_in_views
 from sagesplat.core.config import FitConfig
-from sagesplat.core.errors import RunError
+from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.events import Emit
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.levels import LevelFile
@@ -248,11 +248,15 @@ class Job:
     @cached_property
     def ladder(self) -> Ladder:
         """The levels to choose from: prefixes of the nested model, or those that training recorded."""
-        nested = self.run.ladder == "nested"
-        ladder = (
-            NestedLadder(read_prefixes(self.run.prefixes), self.cells.label_of) if nested else self.recorded
-        )
-        path = self.run.prefixes if nested else self.run.levels
+        if self.run.ladder != "nested":
+            path, ladder = self.run.levels, self.recorded
+        else:
+            path, prefixes = self.run.prefixes, read_prefixes(self.run.prefixes)
+            if prefixes.sizes.keys() != self.cells.label_of.keys():
+                raise DataError(
+                    f"{path}: not of the cells beside it; delete it and run `sagesplat nest` again"
+                )
+            ladder = NestedLadder(prefixes, self.cells.label_of)
         self.check_named(path, sorted({label for label, _ in ladder.counts}))
         return ladder
 

@@ -147,6 +147,8 @@ def _check_plans(job: Job, plans: Iterable[Plan]) -> None:
             if (choice.label_id, choice.level) not in job.ladder.counts:
                 what = f"level {choice.level} of category {choice.label_id}"
                 raise _foreign(job.run.plan, "plan", what)
+        if left := {label for label, _ in job.ladder.counts} - plan.levels.keys():
+            raise _foreign(job.run.plan, "plan", f"a plan without category {min(left)}")
 
 
 def _check(path: Path, stage: str, what: str, values: Iterable[int], known: Iterable[int]) -> None:
