@@ -14,6 +14,11 @@ One kernel serves all levels, only its amplitude differs:
 `heldout_variance` is the variance of a constant by which views that training never saw differ. Length
 scales, `heldout_variance` and `noise` maximise the marginal likelihood, mean over the levels, times a prior
 (eq. 5.8); what each view would be predicted as without itself is eqs. 5.10 to 5.12.
+
+Of many views only m stay in the model (`fit_together`: the subset of regressors, section 8.3.1), with the
+weights that are the best for all n views:
+
+    weights = argmin |values - C_nm weights|^2 + noise weights' C_mm weights
 """
 
 from collections.abc import Sequence
@@ -21,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
@@ -32,6 +37,7 @@ GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 8))
 PRIOR = np.log([0.3, 0.5, 1.0, 0.5, 0.1, 0.1])
 PRIOR_WIDTH = np.array([0.7, 0.7, 0.7, 0.7, 1.5, 1.5])
 PRIOR_REACH = 3.0
+_JITTER = 1e-8  # on the diagonal of C_mm: far below any noise
 FEW = 0.1  # what values are uncertain by if seen in one view; falls as 1 / views
 
 
@@ -75,7 +81,7 @@ class Together:
     """Processes with the same hyperparameters; weights and views left out of each, as of `Process`."""
 
     lengths: tuple[float, float, float, float]
-    weights: list[Float[np.ndarray, "_ K"]]
+    weights: list[Float[np.ndarray, "_ K"]]  # of the views that stay
     left_out: list[Float[np.ndarray, "_ K"]]
 
 
@@ -100,11 +106,18 @@ def fit_process(
     return Process(lengths, heldout_variance, noise, weights, left_out)
 
 
-def fit_together(inputs: Sequence[Float[np.ndarray, "_ 8"]], values: Sequence[np.ndarray]) -> Together:
-    """Fit processes of zero mean that differ in their values [n, K] alone, each at n >= 0 viewpoints."""
-    parts = [(_squares(x), np.zeros(len(x), bool), v) for x, v in zip(inputs, values, strict=True)]
-    theta = _hyperparameters([part for part in parts if len(part[2])])
-    solved = [_solved(part, theta) for part in parts]
+def fit_together(
+    inputs: Sequence[Float[np.ndarray, "_ 8"]],
+    values: Sequence[Float[np.ndarray, "_ K"]],
+    stay: Sequence[Bool[np.ndarray, " _"]],
+) -> Together:
+    """Fit processes of zero mean that differ in their values alone, each at n >= 0 viewpoints.
+
+    `stay`: the views that stay in the models; the hyperparameters are those of these.
+    """
+    all_parts = [(x[some], v[some]) for x, v, some in zip(inputs, values, stay, strict=True) if some.any()]
+    theta = _hyperparameters([(_squares(x), np.zeros(len(x), bool), v) for x, v in all_parts])
+    solved = [_thinned(x, v, some, theta) for x, v, some in zip(inputs, values, stay, strict=True)]
     position, direction, screen, distance, *_ = np.exp(theta).tolist()
     lengths = position, direction, screen, distance
     return Together(lengths, [weights for weights, _ in solved], [left_out for _, left_out in solved])
@@ -115,6 +128,21 @@ _Part = tuple[list[np.ndarray], np.ndarray, np.ndarray]  # squared distances by 
 
 def _squares(x: np.ndarray) -> list[np.ndarray]:
     return [cdist(x[:, group], x[:, group], "sqeuclidean") for group in GROUPS]
+
+
+def _thinned(
+    x: np.ndarray, values: np.ndarray, stay: np.ndarray, theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the views that stay, and what is predicted of each view without it."""
+    *lengths, _, noise = np.exp(theta)
+    own = x[stay]
+    root = cholesky(matern32(own, own, lengths) + _JITTER * np.eye(len(own)), lower=True)
+    basis = solve_triangular(root, matern32(own, x, lengths), lower=True)  # [m, n]
+    factor = cho_factor(basis @ basis.T + noise * np.eye(len(own)))
+    inner = cho_solve(factor, basis @ values)
+    own_part = (basis * cho_solve(factor, basis)).sum(0)  # of each value in its own prediction
+    left_out = values - (values - basis.T @ inner) / (1 - own_part)[:, None]
+    return solve_triangular(root, inner, lower=True, trans=1), left_out
 
 
 def _solved(part: _Part, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -237,8 +237,8 @@ class NestedLevels(Method):
     def _thinned(self, plans: Sequence[Plan], share: float, cameras: Sequence[Camera]) -> dict[int, Plan]:
         """Plans for fidelity by cell, by their place: those that hold in their compositions at `cameras`.
 
-        A category that misses its target there is asked for more, by what it misses. Where that changes
-        nothing its neighbours spill over it, and they are asked for more, by half of what it misses.
+        A category that misses its target there is asked for more, by what it misses, in each round by half as
+        much again. Where that changes nothing its neighbours spill over it: they are asked for half of it.
         """
         job, found, label_of = self.job, dict[int, Plan](), self.job.cells.label_of
         if len(self.cell_costs.labels) == len(self.costs.labels) or len(cameras) < fewest_views(share):
@@ -253,7 +253,7 @@ class NestedLevels(Method):
             if plan.quality == "fidelity" and share < 1
         }
         before = dict[int, dict[int, int]]()
-        for _ in range(_RAISES):
+        for again in range(_RAISES):
             tried = {
                 i: thinned(plans[i], sampled.fidelity, pixels, self.cell_costs, label_of, asked)
                 for i, asked in reaching.items()
@@ -272,7 +272,7 @@ class NestedLevels(Method):
                 before[i] = levels
                 spilt = max((by for label, by in missed.items() if label not in changed), default=0.0)
                 for label in reaching[i]:
-                    reaching[i][label] += missed.get(label, spilt / 2)
+                    reaching[i][label] += missed.get(label, spilt / 2) * 1.5**again
         return found
 
     def _in_composition(self, plans: Sequence[Plan], cameras: Sequence[Camera]) -> np.ndarray:

@@ -30,12 +30,12 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.methods import method_of
 
-VIEWS = (60, 120, 240)  # to fit to: the next number is tried while the last step made the error smaller by
-_SHRINKS = 0.1  # at least this share
-DEFAULT_COUNTS = {"fit": VIEWS[1], "bias": 90, "calibration": 150}  # as many as the training's time allows;
+VIEWS = (100, 200, 400)  # to fit to: the next number is tried while the last step made the error smaller by
+_SHRINKS = 0.05  # at least this share
+DEFAULT_COUNTS = {"fit": VIEWS[-1], "bias": 90, "calibration": 150}  # as many as the training's time allows;
 MOST = {"fit": VIEWS[-1], "bias": 90, "calibration": 300}  # after a long training up to these, by
 _EXTRA = 0.25  # this share of its time: they make bounds a little tighter, no more
-_RENDERS = 2.5  # a training step: a render takes about a quarter of it (demo: 0.4 to 0.55 of its training's)
+_RENDERS = 3.7  # a training step
 _SEED = 0  # of the draws
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
