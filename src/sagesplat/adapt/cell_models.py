@@ -81,7 +81,7 @@ class FidelityModel:
 
     @property
     def num_views(self) -> int:
-        """Views that show some of its cells."""
+        """Views in it that show some of its cells."""
         return len(np.unique(np.concatenate([cell.rows for cell in self.cells])))
 
     @property
