@@ -165,23 +165,29 @@ class _Rasterize(torch.autograd.Function):
             places = torch.from_numpy(g_mean2d), None, torch.from_numpy(g_features), None
             return None, *places, *(of.get(name) for name in PARAMETERS)
         enough: Any = _enough(*arrays)
-        gradients = [space.take(name, *a.shape) for name, a in zip(PARAMETERS, enough, strict=True)]
+        gradients = [
+            space.take(name, *a.shape) if name != "shN" or name in asked else a[:0]
+            for name, a in zip(PARAMETERS, enough, strict=True)
+        ]
         num_bases = sh.num_bases(options.degree)
-        if space.gradients_of != (n, num_bases):  # harmonics that are not in use stay at zero
+        if "shN" in asked and space.gradients_of != (
+            n,
+            num_bases,
+        ):  # harmonics that are not in use stay at zero
             gradients[-1].fill(0)
             space.gradients_of = n, num_bases
         lists = _enough(painted[0], moved, g_mean2d, g_conic, g_opacity, g_color)
         fixed = project.camera_vector(camera), num_bases, options.antialiased
         d_turns = np.zeros((len(enough[0]) if to_pose else 0, 3), np.float32)
         project.backward(*fixed, *enough, *lists, *gradients, d_turns)
-        gradients = [g[:n] for g in gradients]
+        gradients = [g[:n] for g in gradients if len(g)]
         pose = _of_pose(camera, gradients[0], d_turns[:n]) if to_pose else None
         if to_pose and options.trainable is not None:
             for g in (g_mean2d, g_features, *gradients):
                 g[~options.trainable] = 0
         return (
             None, torch.from_numpy(g_mean2d), None, torch.from_numpy(g_features), pose,
-            *map(torch.from_numpy, gradients),
+            *map(torch.from_numpy, gradients), *[None] * (len(PARAMETERS) - len(gradients)),
         )  # fmt: skip
 
 

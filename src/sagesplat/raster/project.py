@@ -322,9 +322,10 @@ def _color_gradient(i, drawn, dx, dy, dz, shN, num_bases, records, g_color, d_sh
         basis, at = load8(scratch, 8 * k), i * width + 3 * k - 3
         weight = red * gather(shN, at, width) + green * gather(shN, at + 1, width)
         store(weights, 8 * k, weight + blue * gather(shN, at + 2, width))
-        scatter(d_shN, at, width, basis * red)
-        scatter(d_shN, at + 1, width, basis * green)
-        scatter(d_shN, at + 2, width, basis * blue)
+        if d_shN.size > 0:
+            scatter(d_shN, at, width, basis * red)
+            scatter(d_shN, at + 1, width, basis * green)
+            scatter(d_shN, at + 2, width, basis * blue)
     return _direction_gradient(dx, dy, dz, _load_sixteen(weights))
 
 
@@ -341,8 +342,8 @@ def _backward_eight(
         d_log_scales[i : i + LANES] = 0.0
         d_logits[i : i + LANES] = 0.0
         d_sh0[i : i + LANES] = 0.0
-        d_shN[i : i + LANES, : num_bases - 1] = 0.0
-        d_turns[i : i + LANES] = 0.0  # it may have no rows
+        d_shN[i : i + LANES, : num_bases - 1] = 0.0  # it may have no rows
+        d_turns[i : i + LANES] = 0.0  # nor this
         return
     mx, my, mz = _three(means, i)
     qw, qx, qy, qz = _four(quats, i)
@@ -452,7 +453,7 @@ def backward(
     g_mean2d [N, 2]; g_conic [N, 3] for the inverse covariance's xx, xy (counted once), yy;
     g_opacity [N] of the opacity that blending saw; g_color [N, 3]. All rows are written, of d_shN
     [N, bases - 1, 3] only the first num_bases - 1. d_turns [N, 3]: of a small turn of the camera about its
-    axes (rotation vector, rad); with no rows it is left out.
+    axes (rotation vector, rad). These two are left out with no rows.
     """
     n = len(means)
     chunks = (n + _CHUNK - 1) // _CHUNK
