@@ -50,7 +50,7 @@ MOST_PHOTOS = 256  # by which it is known how far a place is from the photos
 # Views that stay in the models, of all that these learn from: what a browser loads grows with them. Built-in
 # scene and dinosaur, 400 viewpoints, error over that with all of them: 48 1.16 and 1.10; 64 1.13 and 1.06;
 # 96 1.08 and 1.04; 128 1.07 and 1.02.
-MOST_VIEWS = 64
+MOST_VIEWS = 60
 CELL_SHARE = 5e-4  # of a picture that a cell has to cover where its model learns
 _TOWARDS = 4.0  # views that a category's mean counts as, beside those of a cell
 _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more than chance
