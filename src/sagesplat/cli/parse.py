@@ -96,11 +96,11 @@ def _unknown(function: Callable[..., None], words: Sequence[str]) -> str:
     flag = word.partition("=")[0]
     if not flag.startswith("-"):
         return f"{word!r} is one argument too many"
-    known = [f.name for f in flags_of(function) if f.name.startswith("--")]
-    last = {known_flag.rpartition(".")[2]: known_flag for known_flag in known}
-    near = get_close_matches(flag, known, n=1, cutoff=0.5)
-    near = near or [last[m] for m in get_close_matches(flag.strip("-"), last, n=1, cutoff=0.6)]
-    return f"no option {flag}" + (f"; did you mean {near[0]}?" if near else "")
+    known = {f.name.strip("-"): f.name for f in flags_of(function) if f.name.startswith("--")}
+    for names in (known, {name.rpartition(".")[2]: whole for name, whole in known.items()}):
+        if near := get_close_matches(flag.strip("-"), names, n=1):
+            return f"no option {flag}; did you mean {names[near[0]]}?"
+    return f"no option {flag}"
 
 
 def _flat(message: str) -> str:
