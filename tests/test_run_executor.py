@@ -127,6 +127,7 @@ def test_progress_of_several_tasks_is_one_bar() -> None:
     together.tell(1, Progress("x", 5, 20, "text"))
     together.tell(0, Training(4, 10, 0.5, {}, 7))
     together.end(0)
+    together.tell(0, Progress("x", 6, 10, "late"))  # of another machine
     together.tell(2, Progress("alone", 1, 3))
     together.end(2)
     assert heard == [
@@ -134,6 +135,7 @@ def test_progress_of_several_tasks_is_one_bar() -> None:
         Progress("observe", 7, 30, "text"),
         Progress("observe", 9, 30, "loss 0.500"),
         Progress("observe", 15, 30),
+        Progress("observe", 15, 30, "late"),
         Progress("alone", 1, 3),
     ]
 

@@ -125,11 +125,12 @@ class ProgressAggregator:
             self._add(name, number, total, total, "")
 
     def _add(self, name: str, number: int, done: int, total: int, text: str) -> None:
-        reported = self._reported.setdefault(name, {})
-        reported[number] = done, total
+        reported, ended = self._reported.setdefault(name, {}), self._ended.get(name, set())
+        # of a task on another machine an event may come after its end
+        reported[number] = total if number in ended else done, total
         known = sum(of for _, of in reported.values())
         each = known / len(reported)
-        silent = self._ended.get(name, set()) - reported.keys()
+        silent = ended - reported.keys()
         reached = sum(done for done, _ in reported.values()) + each * len(silent)
         whole = known + each * (self._parts[name] - len(reported))
         self._emit(Progress(name, round(reached), round(whole), text))
