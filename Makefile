@@ -40,7 +40,7 @@ suite: $(INSTALLED)
 # everything: also what takes long, or proves what seldom breaks
 test-all: test
 	$(BIN)/pyright
-	$(BIN)/pytest -q -m slow
+	$(BIN)/pytest -q -n 2 --dist loadfile -m slow
 
 .PHONY: types style
 lint: types style

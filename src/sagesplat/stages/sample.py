@@ -32,10 +32,10 @@ from sagesplat.stages.methods import method_of
 
 VIEWS = (100, 200, 400)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.05  # at least this share
-DEFAULT_COUNTS = {"fit": VIEWS[-1], "bias": 90, "calibration": 150}  # as many as the training's time allows;
+DEFAULT_COUNTS = {"fit": 240, "bias": 90, "calibration": 150}  # as many as the training's time allows;
 MOST = {"fit": VIEWS[-1], "bias": 90, "calibration": 300}  # after a long training up to these, by
 _EXTRA = 0.25  # this share of its time: they make bounds a little tighter, no more
-_RENDERS = 3.7  # a training step
+_RENDERS = 3.0  # a training step takes as long: sampling and fitting take 0.6 of the demo's training
 _SEED = 0  # of the draws
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
