@@ -10,8 +10,8 @@ from sagesplat.adapt.cell_models import expect, needed, promised, read_fidelity,
 from sagesplat.adapt.cells import POINTS, STEPS, Cells
 from sagesplat.adapt.fidelity import SampledFidelity, pooled_cells, read_sampled, write_sampled
 from sagesplat.adapt.fidelity_models import (
+    MOST_INDUCING,
     MOST_PHOTOS,
-    MOST_VIEWS,
     NOMINAL,
     TARGETS,
     Trial,
@@ -160,7 +160,7 @@ def test_the_full_model_keeps_everything_and_promises_rise():
     assert np.isnan(bound[~inside]).all()
     model = models[3]
     assert model.levels == tuple(range(1, K + 1))
-    assert (model.status, model.quality, model.num_views) == ("calibrated", "fidelity", MOST_VIEWS)
+    assert (model.status, model.quality, model.num_views) == ("calibrated", "fidelity", MOST_INDUCING)
 
 
 def test_viewpoints_off_the_path_that_need_more_get_more():

@@ -42,7 +42,7 @@ def test_leaving_one_out_in_closed_form_is_what_a_fit_without_the_view_says():
 def test_of_many_views_some_stay_with_the_weights_that_are_best_for_all():
     x, _, values = drawn(40)
     stay = np.arange(40) % 3 == 0
-    (lengths, (weights,), (left_out,)), noise = thinned([x], [values], [stay])
+    (lengths, (weights,), (left_out,)), noise = through([x], [values], [stay])
     C, C_nm = matern32(x[stay], x[stay], lengths), matern32(x, x[stay], lengths)
 
     def best(rows: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ def test_where_all_views_stay_it_is_the_process_itself():
     x, _, values = drawn()
     here, nowhere = np.ones(20, bool), np.zeros(20, bool)
     alone = fit_process(x, nowhere, values)
-    (lengths, weights, left_out), _ = thinned([x, x], [values, values], [here, nowhere])
+    (lengths, weights, left_out), _ = through([x, x], [values, values], [here, nowhere])
     np.testing.assert_allclose(lengths, alone.lengths, rtol=1e-6)
     np.testing.assert_allclose(weights[0], alone.weights, atol=1e-5)
     np.testing.assert_allclose(left_out[0], alone.left_out, atol=1e-5)
@@ -65,7 +65,7 @@ def test_where_all_views_stay_it_is_the_process_itself():
     np.testing.assert_array_equal(left_out[1], 0)
 
 
-def thinned(inputs: list, values: list, stay: list) -> tuple[tuple, float]:
+def through(inputs: list, values: list, stay: list) -> tuple[tuple, float]:
     """What `fit_together` finds, and the noise of the views that stay."""
     found = fit_together(inputs, values, stay)
     (own, own_values), *_ = [(x[some], v[some]) for x, v, some in zip(inputs, values, stay, strict=True)]

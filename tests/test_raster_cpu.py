@@ -154,6 +154,15 @@ def test_the_pose_changes_no_other_gradient():
     assert torch.equal(moved, everything)  # Gaussians that are not trainable show where the camera is, too
 
 
+@pytest.mark.parametrize("names", [("means", "sh0"), ("means", "sh0", "shN")])
+def test_gradients_of_no_gaussians(names):
+    g = random_gaussians(9, degree=1).select(torch.zeros(0, dtype=torch.long))
+    values = {name: getattr(g, name).clone().requires_grad_() for name in names}
+    rgb = rasterize(replace(g, **values), pinhole(), backend="cpu").rgb
+    grads = torch.autograd.grad(rgb.sum(), list(values.values()))
+    assert [grad.shape for grad in grads] == [value.shape for value in values.values()]
+
+
 def test_the_order_of_the_rows_does_not_matter():
     g, camera = random_gaussians(400, seed=7, degree=2), pinhole(90, 70)
     order = torch.randperm(400, generator=torch.Generator().manual_seed(2))

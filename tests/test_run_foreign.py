@@ -189,7 +189,11 @@ def agree(run: Path) -> None:
         path = RunDir(run).provenance(stage)
         try:
             record = read_json(path)
-            names = [name for name in record["inputs"] if (run / name).is_file()]  # "/" would be read whole
+            paths = {name: (run / name).resolve() for name in record["inputs"]}
+            # of folders those of the run: "/" would be read whole
+            names = [
+                name for name, at in paths.items() if at.is_file() or (at.exists() and at.is_relative_to(run))
+            ]
             record["inputs"] |= records.input_hashes(RunDir(run), [run / name for name in names])
             write_json(path, record)
         except (SageError, TypeError, KeyError, UnicodeError):

@@ -22,7 +22,8 @@ class Shown(NamedTuple):
     """What a method draws in a frame at one setting of its knob."""
 
     image: np.ndarray  # float32 [H, W, 3] in [0, 1]; may be overwritten by the next one
-    count: int  # pyright: ignore[reportIncompatibleMethodOverride]  # splats that are selected, in sight or not: what a viewer's budget counts
+    # splats that are selected, in sight or not: what a viewer's budget counts
+    count: int  # pyright: ignore[reportIncompatibleMethodOverride]
     needed: np.ndarray  # bool [P], pieces of its files that have to be there
 
 

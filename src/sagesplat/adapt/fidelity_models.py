@@ -47,10 +47,10 @@ NOTHING_HELD = np.zeros(len(TARGETS), bool)
 _ABOVE = 1e-9  # a threshold lies above its critical value
 _MARGINS = (-1.0, 10.0)  # limits of preliminary ones
 MOST_PHOTOS = 256  # by which it is known how far a place is from the photos
-# Views that stay in the models, of all that these learn from: what a browser loads grows with them. Built-in
-# scene and dinosaur, 400 viewpoints, error over that with all of them: 48 1.16 and 1.10; 64 1.13 and 1.06;
-# 96 1.08 and 1.04; 128 1.07 and 1.02.
-MOST_VIEWS = 60
+# Inducing views, of all that the models learn from: what a browser loads grows with them. Built-in scene and
+# dinosaur, 400 viewpoints, error over that with all of them: 48 1.16 and 1.10; 64 1.13 and 1.06; 96 1.08 and
+# 1.04; 128 1.07 and 1.02.
+MOST_INDUCING = 60
 CELL_SHARE = 5e-4  # of a picture that a cell has to cover where its model learns
 _TOWARDS = 4.0  # views that a category's mean counts as, beside those of a cell
 _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more than chance
@@ -91,7 +91,7 @@ def fit_fidelity(
     inside = np.clip(screen, *screens)
     views = inputs_of(np.ones(len(cameras)), position, direction, extent, 0.0, inside)[:, :7]
     sight, places = look(cells, cameras), photo_places(photos, extent)
-    stay = _spread(views, MOST_VIEWS, (*PHOTO_LENGTHS, 1.0))
+    inducing = _farthest(views, MOST_INDUCING, (*PHOTO_LENGTHS, 1.0))
     whole = sampled.by_label(cells.label_of)
     models, shown = {}, whole.shown()
     for column, label in enumerate(whole.labels):
@@ -100,8 +100,8 @@ def fit_fidelity(
             part = _Part(mine, cells.ids[mine].tolist(), sampled, sight)
             rows = np.flatnonzero(shown[:, column])
             models[label] = _fit(
-                label, part, views, stay, whole.fidelity[rows, column].astype(np.float64), rows, confidence,
-                places, extent, focal, screens,
+                label, part, views, inducing, whole.fidelity[rows, column].astype(np.float64), rows,
+                confidence, places, extent, focal, screens,
             )  # fmt: skip
     return models
 
@@ -120,7 +120,7 @@ def _fit(
     label: int,
     part: _Part,
     views: Float[np.ndarray, "V 7"],
-    stay: Int[np.ndarray, " M"],  # rows of those that stay in the model
+    inducing: Int[np.ndarray, " M"],  # rows of the views that stay in the model
     category: Float[np.ndarray, "n K"],  # fidelity in the rows that show it
     rows: Int[np.ndarray, " n"],
     confidence: float,
@@ -146,24 +146,24 @@ def _fit(
         inputs.append(np.column_stack([views[own], log]))
         offsets.append((values.sum(0) + _TOWARDS * average) / (len(own) + _TOWARDS))
         rest.append((values - offsets[-1])[:, learnt])
-    staying = [np.isin(own, stay) for own in seen]
-    process = fit_together(inputs, rest, staying)
+    induces = [np.isin(own, inducing) for own in seen]
+    process = fit_together(inputs, rest, induces)
     cells, left_out = [], np.full((*shares.shape, len(average)), np.nan)
-    for i, (column, own, kept) in enumerate(zip(part.columns, seen, staying, strict=True)):
+    for i, (column, own, kept) in enumerate(zip(part.columns, seen, induces, strict=True)):
         weights = np.zeros((kept.sum(), len(average)))
         weights[:, learnt] = process.weights[i]
         found = sampled.fidelity[own, column].astype(np.float64)
         found[:, learnt] = offsets[i][learnt] + process.left_out[i]
         left_out[own, column] = monotone(found)
-        log, row, v = inputs[i][kept, 7], np.searchsorted(stay, own[kept]), factors[stay, column]
+        log, row, v = inputs[i][kept, 7], np.searchsorted(inducing, own[kept]), factors[inducing, column]
         cells.append(CellModel(part.ids[i], offsets[i], row, log, medians[i], weights.T, v))
     # the category at equal levels, from its cells without the view
     weight = np.where(np.isnan(left_out[:, part.columns, 0]), 0, shares[:, part.columns])[rows]
     sums = np.einsum("vc,vck->vk", weight, np.nan_to_num(left_out[:, part.columns])[rows])
     total = weight.sum(1, keepdims=True)
     without = np.where(total > 0, sums / np.where(total > 0, total, 1), average)
-    near = matern32(views, views[stay], process.lengths[:3])
-    near[stay, np.arange(len(stay))] = 0
+    near = matern32(views, views[inducing], process.lengths[:3])
+    near[inducing, np.arange(len(inducing))] = 0
     scale = AT_A_PHOTO + away_from(views[rows], photos, near[rows].max(1))
     margins = np.clip(
         [
@@ -177,7 +177,7 @@ def _fit(
         extent=extent,
         focal=focal,
         screens=screens,
-        views=views[stay],
+        views=views[inducing],
         lengths=process.lengths,
         photos=photos,
         cells=tuple(cells),
@@ -193,11 +193,11 @@ def photo_places(photos: Sequence[Camera], extent: float) -> Float[np.ndarray, "
     """`ViewModel.photos` of cameras, at most `MOST_PHOTOS`."""
     position, direction, _ = where(photos, 1.0)
     places = np.column_stack([position / extent, direction])
-    return places[_spread(places, MOST_PHOTOS, PHOTO_LENGTHS)].T
+    return places[_farthest(places, MOST_PHOTOS, PHOTO_LENGTHS)].T
 
 
-def _spread(places: Float[np.ndarray, "n D"], most: int, lengths: Sequence[float]) -> Int[np.ndarray, " m"]:
-    """Rows of at most so many of n >= 1 places, ascending: each is the furthest from those before it."""
+def _farthest(places: Float[np.ndarray, "n D"], most: int, lengths: Sequence[float]) -> Int[np.ndarray, " m"]:
+    """Rows of at most so many of n >= 1 places, ascending: each is the farthest from those before it."""
     chosen, away = [0], np.full(len(places), np.inf)
     while len(chosen) < min(most, len(places)):
         away = np.minimum(away, 1 - matern32(places, places[chosen[-1:]], lengths)[:, 0])

@@ -15,8 +15,8 @@ One kernel serves all levels, only its amplitude differs:
 scales, `heldout_variance` and `noise` maximise the marginal likelihood, mean over the levels, times a prior
 (eq. 5.8); what each view would be predicted as without itself is eqs. 5.10 to 5.12.
 
-Of many views only m stay in the model (`fit_together`: the subset of regressors, section 8.3.1), with the
-weights that are the best for all n views:
+Of many views only m, the inducing ones, stay in the model (`fit_together`: the subset of regressors, section
+8.3.1), with the weights that are the best for all n views:
 
     weights = argmin |values - C_nm weights|^2 + noise weights' C_mm weights
 """
@@ -81,7 +81,7 @@ class Together:
     """Processes with the same hyperparameters; weights and views left out of each, as of `Process`."""
 
     lengths: tuple[float, float, float, float]
-    weights: list[Float[np.ndarray, "_ K"]]  # of the views that stay
+    weights: list[Float[np.ndarray, "_ K"]]  # of the inducing views
     left_out: list[Float[np.ndarray, "_ K"]]
 
 
@@ -109,15 +109,17 @@ def fit_process(
 def fit_together(
     inputs: Sequence[Float[np.ndarray, "_ 8"]],
     values: Sequence[Float[np.ndarray, "_ K"]],
-    stay: Sequence[Bool[np.ndarray, " _"]],
+    inducing: Sequence[Bool[np.ndarray, " _"]],
 ) -> Together:
     """Fit processes of zero mean that differ in their values alone, each at n >= 0 viewpoints.
 
-    `stay`: the views that stay in the models; the hyperparameters are those of these.
+    `inducing`: which views stay in the models; the hyperparameters are those of these.
     """
-    all_parts = [(x[some], v[some]) for x, v, some in zip(inputs, values, stay, strict=True) if some.any()]
+    all_parts = [
+        (x[some], v[some]) for x, v, some in zip(inputs, values, inducing, strict=True) if some.any()
+    ]
     theta = _hyperparameters([(_squares(x), np.zeros(len(x), bool), v) for x, v in all_parts])
-    solved = [_thinned(x, v, some, theta) for x, v, some in zip(inputs, values, stay, strict=True)]
+    solved = [_solved_through(x, v, some, theta) for x, v, some in zip(inputs, values, inducing, strict=True)]
     position, direction, screen, distance, *_ = np.exp(theta).tolist()
     lengths = position, direction, screen, distance
     return Together(lengths, [weights for weights, _ in solved], [left_out for _, left_out in solved])
@@ -130,12 +132,12 @@ def _squares(x: np.ndarray) -> list[np.ndarray]:
     return [cdist(x[:, group], x[:, group], "sqeuclidean") for group in GROUPS]
 
 
-def _thinned(
-    x: np.ndarray, values: np.ndarray, stay: np.ndarray, theta: np.ndarray
+def _solved_through(
+    x: np.ndarray, values: np.ndarray, inducing: np.ndarray, theta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the views that stay, and what is predicted of each view without it."""
+    """Weights of the inducing views, and what is predicted of each view without it."""
     *lengths, _, noise = np.exp(theta)
-    own = x[stay]
+    own = x[inducing]
     root = cholesky(matern32(own, own, lengths) + _JITTER * np.eye(len(own)), lower=True)
     basis = solve_triangular(root, matern32(own, x, lengths), lower=True)  # [m, n]
     factor = cho_factor(basis @ basis.T + noise * np.eye(len(own)))

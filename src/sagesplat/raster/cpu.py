@@ -180,7 +180,9 @@ class _Rasterize(torch.autograd.Function):
         fixed = project.camera_vector(camera), num_bases, options.antialiased
         d_turns = np.zeros((len(enough[0]) if to_pose else 0, 3), np.float32)
         project.backward(*fixed, *enough, *lists, *gradients, d_turns)
-        gradients = [g[:n] for g in gradients if len(g)]
+        gradients = [
+            g[:n] for name, g in zip(PARAMETERS, gradients, strict=True) if name in asked or name != "shN"
+        ]
         pose = _of_pose(camera, gradients[0], d_turns[:n]) if to_pose else None
         if to_pose and options.trainable is not None:
             for g in (g_mean2d, g_features, *gradients):

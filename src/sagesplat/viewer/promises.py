@@ -178,7 +178,7 @@ def _cell(
     views: Float[np.ndarray, "V 7"],
 ) -> dict[str, Any]:
     """The entry of a cell; `place`: of each view among the shared ones `views`, `order` the reverse of it."""
-    by_place = np.argsort(place[cell.rows], kind="stable")[_sent_views(len(cell.rows))]
+    by_place = np.argsort(place[cell.rows], kind="stable")
     known = np.column_stack([model.views[cell.rows], cell.log_distances])
     sent, weights = known[by_place], cell.weights.T[:, columns]
     factors = np.where(cell.factors < 0, -1, np.round(cell.factors / FACTOR_STEP))[order]
