@@ -264,12 +264,14 @@ class References:
         if not self.wanted.all():
             label_ids = self._last.render(camera)
             tile_mask = tiles_around(np.isin(label_ids, np.array(self.labels)[self.wanted]))
-        image = self._full.paint(camera, tile_mask)
+        image = None
         if label_ids is None and isinstance(self._ladder, PrefixLadder):
             last = dict.fromkeys(self.labels, self._ladder.levels[-1])
             levels = self._seen(camera, tile_mask, compositions and [*compositions, last])
             label_ids = levels.label_ids(last)
+            image = levels.render(last).copy() if self._given is None else None
         label_ids = self._last.render(camera) if label_ids is None else label_ids
+        image = self._full.paint(camera, tile_mask) if image is None else image
         counts = np.bincount(label_ids.ravel().astype(np.int64) - UNLABELLED, minlength=2 + max(self.labels))
         pixels = counts[np.array(self.labels) - UNLABELLED].astype(np.int32)
         return Reference(image, label_ids, pixels, levels, tile_mask)

@@ -14,7 +14,7 @@ Three sets of drawn viewpoints are used, each for one thing:
    done twice.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -298,28 +298,33 @@ def remove_composition_bias(
     one threshold for all would keep more than is asked on the path, and less among the cameras.
     This is no calibration: it brings what is calibrated close to what is asked.
     """
-    found = dict(models)
-    for label, model in models.items():
-        critical, away = trial.critical(label), trial.away[trial.views(label)]
-        sides = [away < _NEAR, away >= _NEAR]
-        if min(side.sum() for side in sides) >= _FEW:
-            found[label] = _by_place(model, critical, away, sides, confidence)
-        elif len(away):
-            found[label] = _asked(model, _empirical(critical, confidence))
-    return found
+    return {
+        label: _by_place(model, trial, label, _FEW, lambda critical: _empirical(critical, confidence))
+        if len(trial.views(label))
+        else model
+        for label, model in models.items()
+    }
 
 
 def _by_place(
     model: FidelityModel,
-    critical: Float[np.ndarray, "G n"],
-    away: Float[np.ndarray, " n"],
-    sides: Sequence[Bool[np.ndarray, " n"]],
-    confidence: float,
+    trial: Trial,
+    label: int,
+    fewest: int,
+    asked: Callable[[Float[np.ndarray, "G n"]], Float[np.ndarray, " G"]],
 ) -> FidelityModel:
-    """The model with thresholds that go linearly from what some viewpoints need to what the others do."""
+    """The model with thresholds that go linearly from what viewpoints on the path need to what others do.
+
+    `asked`: what to ask for TARGETS, from the critical nominal targets of some viewpoints. Those of all count
+    together where fewer than `fewest` of either kind show the category.
+    """
+    critical, away = trial.critical(label), trial.away[trial.views(label)]
+    sides = [away < _NEAR, away >= _NEAR]
+    if min(side.sum() for side in sides) < fewest:
+        return _asked(model, asked(critical))
     needs, places = [], [float(away[side].mean()) for side in sides]
     for side, place in zip(sides, places, strict=True):
-        thresholds, slopes = _needs(model, _empirical(critical[:, side], confidence))
+        thresholds, slopes = _needs(model, asked(critical[:, side]))
         needs.append(np.minimum(thresholds + slopes * place, 1))
     slopes = (needs[1] - needs[0]) / (places[1] - places[0])
     return _with_needs(model, needs[0] - slopes * places[0], slopes)
@@ -371,23 +376,26 @@ def calibrated(
         held: Targets whose thresholds must not fall, as other categories need them.
 
     Returns:
-        Models by label id. "calibrated" from 19 viewpoints that show the category (at 0.95). With fewer the
-        nominal targets are the largest ones of all categories and of its own: "uncalibrated".
+        Models by label id. "calibrated" from 19 viewpoints that show the category (at 0.95); where as many do
+        on the capture's path and off it, each by itself. With fewer the nominal targets are the largest ones
+        of all categories and of its own: "uncalibrated".
     """
-    fewest, asked = fewest_views(confidence), {}
-    for label in models:
-        if len(trial.views(label)) >= fewest:
-            values = [conformal_quantile(values, confidence) for values in trial.critical(label)]
-            asked[label] = np.where(held, np.maximum(values, TARGETS), values)
+    fewest = fewest_views(confidence)
+
+    def conformal(critical: Float[np.ndarray, "G n"]) -> Float[np.ndarray, " G"]:
+        values = np.array([conformal_quantile(values, confidence) for values in critical])
+        return np.where(held, np.maximum(values, TARGETS), values)
+
+    asked = {label: conformal(trial.critical(label)) for label in models if len(trial.views(label)) >= fewest}
     # nothing is known below the last level where not even one category could be calibrated
     widest = np.max([*asked.values()], axis=0) if asked else np.ones(len(TARGETS))
     found = {}
     for label, model in models.items():
         views = len(trial.views(label))
-        nominal = asked.get(label)
-        if nominal is None:
-            nominal = np.maximum(widest, trial.critical(label).max(1)) if views else widest
-        made = _asked(model, nominal)
+        if label in asked:
+            made = _by_place(model, trial, label, fewest, conformal)
+        else:
+            made = _asked(model, np.maximum(widest, trial.critical(label).max(1)) if views else widest)
         status = "calibrated" if label in asked else "uncalibrated"
         least = model.calibration.least_support
         least = min(least, trial.least_support(label)) if views else least
