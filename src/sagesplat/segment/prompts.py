@@ -13,7 +13,7 @@ from sagesplat.segment.edit import free_id, named
 from sagesplat.segment.masks import UNLABELLED_NAME
 
 _ARTICLES = {"a", "an", "the"}
-_RESERVED = ",=@"  # what other options separate names with, and what blocks add to them
+_RESERVED = ",="  # what other options separate names with
 
 
 @dataclass(frozen=True)

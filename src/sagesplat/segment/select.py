@@ -20,8 +20,7 @@ def select_mask(
 
     Args:
         gaussians: N labelled Gaussians.
-        wanted: A name, or several as in "chair 2,vase". A category means its instances too; in a scene in
-            blocks "chair" means "chair@0", "chair@1" and so on.
+        wanted: A name, or several as in "chair 2,vase". A category means its instances too.
         names: Names by label id: `FinishedRun.names`, or `Splat.names` of `read_splat`.
         parents: By label id of an instance, its category: `FinishedRun.parents` or `Splat.parents`.
 
