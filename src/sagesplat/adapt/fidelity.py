@@ -216,13 +216,14 @@ class References:
     def _last(self) -> RenderedLabels:
         """The last level by itself: a copy, which is made where the seen levels do not serve."""
         last = self._ladder.load(self._ladder.levels[-1]).to(device_of(self._backend))
-        return RenderedLabels(last, self._backend, self._antialiased)
+        return RenderedLabels(last, self._backend, self._antialiased, self._workspace)
 
     @cached_property
     def _full(self) -> RenderedLabels:
         if self._given is None:
             return self._last
-        return RenderedLabels(self._given.to(device_of(self._backend)), self._backend, self._antialiased)
+        given = self._given.to(device_of(self._backend))
+        return RenderedLabels(given, self._backend, self._antialiased, self._workspace)
 
     def at(self, camera: Camera, compositions: Sequence[Mapping[int, int]] | None = None) -> Reference:
         """The full model's image and label image, and its levels, from a viewpoint.

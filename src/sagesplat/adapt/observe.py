@@ -152,8 +152,8 @@ class RenderedLabels:
     gaussians: Gaussians
     backend: Backend = "auto"
     antialiased: bool = False
+    workspace: Workspace = field(default_factory=Workspace)
     _kept: dict[str, Int16[np.ndarray, "H W"]] = field(default_factory=dict)
-    _workspace: Workspace = field(default_factory=Workspace)
 
     def __getitem__(self, view: View) -> Int16[np.ndarray, "H W"]:
         """Per pixel the category that paints most of it; -1 where more shines through than that."""
@@ -184,7 +184,7 @@ class RenderedLabels:
         ):
             return self.paint(camera), self.render(camera)
         ids, columns = self._columns
-        drawn, rows = drawn_from(self.gaussians, None, {}, camera, self.antialiased, self._workspace)
+        drawn, rows = drawn_from(self.gaussians, None, {}, camera, self.antialiased, self.workspace)
         everything = [(0, len(rows), 0.0)]
         if len(ids) == 2 and UNLABELLED not in self.gaussians.counts():  # what does not shine through
             image = drawn.render(everything)
@@ -194,7 +194,7 @@ class RenderedLabels:
 
     @property
     def _how(self) -> dict[str, Any]:
-        return {"antialiased": self.antialiased, "backend": self.backend, "workspace": self._workspace}
+        return {"antialiased": self.antialiased, "backend": self.backend, "workspace": self.workspace}
 
     @cached_property
     def _columns(self) -> tuple[Int16[np.ndarray, " L"], Tensor]:

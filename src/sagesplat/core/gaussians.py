@@ -169,6 +169,9 @@ def concat(parts: Sequence[Gaussians]) -> Gaussians:
     """The Gaussians of several sets, in order; shN is zero-padded to the largest degree."""
     bases = max(p.shN.shape[1] for p in parts)
     padded = [
-        replace(p, shN=torch.nn.functional.pad(p.shN, (0, 0, 0, bases - p.shN.shape[1]))) for p in parts
+        replace(p, shN=torch.nn.functional.pad(p.shN, (0, 0, 0, bases - p.shN.shape[1])))
+        if p.shN.shape[1] < bases  # padding by nothing copies
+        else p
+        for p in parts
     ]
     return Gaussians(**{f.name: torch.cat([getattr(p, f.name) for p in padded]) for f in fields(Gaussians)})

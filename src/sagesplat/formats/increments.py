@@ -167,8 +167,8 @@ def read_increments(folder: Path, listed: Sequence[Increment], *, by_category: b
 
     Their `label_ids` are cell ids, or those of categories. DataError for a missing or damaged file.
     """
-    parts = []
-    for some in by_file(folder, listed):
+
+    def of_file(some: Sequence[Increment]) -> Gaussians:
         if some[0].format == "stream":
             found = [
                 decoded.shown().slices([_rows(folder, decoded, one) for one in own])
@@ -179,8 +179,10 @@ def read_increments(folder: Path, listed: Sequence[Increment], *, by_category: b
         part = concat(found)
         if by_category:
             part = replace(part, label_ids=torch.full_like(part.label_ids, some[0].label_id))
-        parts.append(part)
-    return concat(parts)
+        return part
+
+    parts = [of_file(some) for some in by_file(folder, listed)]
+    return concat(parts) if len(parts) > 1 else parts[0]
 
 
 def by_file(folder: Path, listed: Sequence[Increment]) -> list[list[Increment]]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from numba import prange
 
 from sagesplat.core.errors import DataError, short
@@ -127,7 +127,7 @@ def _write(path: Path, header: LevelFile, g: Gaussians, more: dict[str, Any], ex
     whole["shN"] = whole["shN"][:, : num_bases(header.sh_degree) - 1]
     label_ids = g.label_ids.cpu().numpy()
     for label in header.counts:
-        rows = np.flatnonzero(label_ids == label)
+        rows = _range_if_one(np.flatnonzero(label_ids == label))
         values = {name: value[rows] for name, value in whole.items()}
         if exact:
             columns = {name: value.astype(np.float32, copy=False) for name, value in values.items()}
@@ -136,6 +136,12 @@ def _write(path: Path, header: LevelFile, g: Gaussians, more: dict[str, Any], ex
         arrays |= {f"{label}/{name}": column for name, column in columns.items()}
     with atomic_path(path, nbytes=sum(a.nbytes for a in arrays.values())) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
+
+
+def _range_if_one(rows: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"] | slice:
+    """Rows that follow each other as a slice, which copies nothing."""
+    first, last = rows[0], rows[-1]
+    return slice(first, last + 1) if last - first == len(rows) - 1 else rows
 
 
 def _encoded(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

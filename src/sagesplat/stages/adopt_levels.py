@@ -17,7 +17,7 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import full_scene, palettes_of, read_increments
 from sagesplat.formats.levels import write_set
 from sagesplat.formats.stream_header import AS_GIVEN, Precision, rounded
-from sagesplat.formats.stream_increments import write_streams
+from sagesplat.formats.stream_increments import Streams, write_streams
 from sagesplat.metrics.image import ssim_map
 from sagesplat.raster import Workspace, device_of, each_view
 from sagesplat.run.job import Job
@@ -74,7 +74,9 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
             check_nest(job, len(g), g.sh_degree)
         ladder, num_lower = _ladder(job, g, shares, config, checkpoint_key(run, settings, inputs))
         ladder, label_of = in_cells(ladder, cells_wanted(len(g)))
-        lines = _write(job, ladder, label_of, num_lower, g, settings, config.lossless)
+        made, replaces = _streams(job, ladder, label_of, g, config.lossless), ladder.replaces
+        del ladder  # of millions of Gaussians: what is read back takes as much
+        lines = _prefixes(job, made, replaces, label_of, num_lower, g, settings)
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -198,31 +200,42 @@ def _trained(
     return split_sets(trained.gaussians, sets)
 
 
-def _write(
+def _streams(
+    job: Job, ladder: Assembled, label_of: Mapping[int, int], before: Gaussians, lossless: bool
+) -> Streams:
+    """Write the increments of a ladder.
+
+    Levels of the originals are exact, or rounded as finely as they need to look the same. Those below are
+    rounded as trained levels are.
+    """
+    job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
+    last = None if lossless else _precision(job, before, _targets(job, before))
+    return write_streams(
+        job.run.increments, ladder.gaussians, ladder.sizes, job.names(), label_of=label_of,
+        replaces=ladder.replaces, last=last, antialiased=job.antialiased,
+    )  # fmt: skip
+
+
+def _targets(job: Job, before: Gaussians) -> list[tuple[int, np.ndarray]]:
+    """Images of what came in, by view."""
+    rows, space = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace()
+    return [(row, _image(job, before, row, space)) for row in rows]
+
+
+def _prefixes(
     job: Job,
-    ladder: Assembled,
+    made: Streams,
+    replaces: Mapping[int, tuple[int, ...]],
     label_of: Mapping[int, int],
     num_lower: int,
     before: Gaussians,
     settings: dict[str, Any],
-    lossless: bool,
 ) -> list[str]:
-    """Write the ladder and its increments.
-
-    The levels above `num_lower` are of the originals: exact, or rounded as finely as they need to look the
-    same. Those below are rounded as trained levels are.
-    """
-    run, levels = job.run, len(next(iter(ladder.sizes.values())))
-    run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
-    rows, space = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace()
-    targets = [(row, _image(job, before, row, space)) for row in rows]
-    made = write_streams(
-        run.increments, ladder.gaussians, ladder.sizes, job.names(), label_of=label_of,
-        replaces=ladder.replaces, last=None if lossless else _precision(job, before, targets),
-        antialiased=job.antialiased,
-    )  # fmt: skip
+    """Write the ladder as its increments show it; `num_lower` of the levels are not of the originals."""
+    run, levels, lossless = job.run, len(next(iter(made.sizes.values()))), settings["lossless"]
+    targets = _targets(job, before)
     sent = read_increments(run.increments, made.increments)
-    write_set(run.prefixes, sent, settings["steps"], made.sizes, replaces=ladder.replaces, exact=True)
+    write_set(run.prefixes, sent, settings["steps"], made.sizes, replaces=replaces, exact=True)
     top = NestedLadder(read_prefixes(run.prefixes), dict(label_of)).load(levels)
     ssim, decibels = _kept(job, top, targets)
     if not lossless and (other := sum(one.format != "stream" for one in made.increments)):
