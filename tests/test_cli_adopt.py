@@ -188,7 +188,7 @@ def test_a_killed_one_resumes_with_the_same_command(
 
     words = ("adopt", finished.parent / "ball.ply", tmp_path / "run", *SMALL, *FEW)
     with monkeypatch.context() as patch:
-        patch.setattr(adopt_levels, "_write", killed)
+        patch.setattr(adopt_levels, "_streams", killed)
         code, said = command(*words)
     assert code != 0
     assert "Traceback" not in said
