@@ -50,11 +50,22 @@ class Opened:
         Playwright's `wait_for_function` evaluates text on the page, which the viewer's policy forbids.
         """
         end = time.monotonic() + seconds
-        while not (value := self.page.evaluate(expression)):
+        while not (value := self._value(expression)):
             if time.monotonic() > end:
                 raise TimeoutError(f"{expression} is not true after {seconds:g} s; {self.complaints}")
             self.page.wait_for_timeout(50)
         return value
+
+    def _value(self, expression: str) -> Any:
+        """None while the page loads anew."""
+        from playwright.sync_api import Error
+
+        try:
+            return self.page.evaluate(expression)
+        except Error as error:
+            if "Execution context was destroyed" not in str(error):
+                raise
+            return None
 
     def cdp(self) -> "CDPSession":
         """A session of the DevTools protocol with the page."""

@@ -196,7 +196,7 @@ def agree(run: Path) -> None:
             ]
             record["inputs"] |= records.input_hashes(RunDir(run), [run / name for name in names])
             write_json(path, record)
-        except (SageError, TypeError, KeyError, UnicodeError):
+        except (SageError, TypeError, KeyError, ValueError):
             continue
 
 
