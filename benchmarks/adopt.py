@@ -35,7 +35,7 @@ from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.api import run_scene
 
-PACKAGE = "@playcanvas/splat-transform@3.7"  # the newest that the registry has
+PACKAGE = "@playcanvas/splat-transform@3.7"
 SPLATS = GARDEN.parent.parent / "splats"
 SHARES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
 BELOW = (0.0125, 0.025)  # so that small levels share a set with those as in a usual ladder
@@ -223,7 +223,7 @@ def score(g: Gaussians, full: Gaussians, cameras: Sequence[Camera], antialiased:
 def _best(
     rivals: Sequence[Gaussians], full: Gaussians, cameras: Sequence[Camera], antialiased: bool
 ) -> Quality:
-    """Of the best of some levels by SSIM."""
+    """The score of the best of some levels by SSIM, and its count."""
     return max(
         (score(rival, full, cameras, antialiased) | {"count": len(rival)} for rival in rivals),
         key=lambda quality: quality["ssim"],

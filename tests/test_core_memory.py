@@ -1,14 +1,12 @@
-"""Memory that runs out is one line, whoever says so; freed memory is given back."""
+"""Memory that runs out is one line, whoever says so."""
 
-import ctypes
 import errno
-import resource
 from pathlib import Path
 
 import pytest
 
 from sagesplat.core.errors import LabelError, OutOfMemory
-from sagesplat.core.memory import give_back, named_memory, ran_out
+from sagesplat.core.memory import named_memory, ran_out
 
 
 def caused(cause: BaseException) -> Exception:
@@ -52,22 +50,3 @@ def test_other_errors_stay_what_they_are(error: Exception, tmp_path: Path) -> No
     assert not ran_out(error)
     with pytest.raises(type(error)), named_memory("run"):
         raise error
-
-
-@pytest.mark.skipif(not hasattr(ctypes.pythonapi, "malloc_trim"), reason="the C library is not glibc")
-def test_freed_memory_is_given_back() -> None:
-    def resident() -> int:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-
-    held = [bytearray(100_000) for _ in range(1000)]  # too small to be mapped one by one
-    last = bytearray(100_000)  # above them all, so that they stay in the heap
-    del held
-    before = resident()
-    give_back()
-    assert resident() < before - 5e7
-    del last
-
-
-def test_nothing_is_given_back_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ctypes, "pythonapi", object())
-    give_back()

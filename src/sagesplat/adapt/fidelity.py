@@ -261,15 +261,14 @@ class References:
 
     def _pictures(self, camera: Camera, compositions: Sequence[Mapping[int, int]] | None) -> Reference:
         """The full model's image and label image, with the levels where the latter is made from them."""
-        tile_mask, levels, label_ids = None, None, None
+        tile_mask, levels, label_ids, image = None, None, None, None
         if not self.wanted.all():
             label_ids = self._last.render(camera)
             tile_mask = tiles_around(np.isin(label_ids, np.array(self.labels)[self.wanted]))
-        image = None
-        if label_ids is None and isinstance(self._ladder, PrefixLadder):
+        if isinstance(self._ladder, PrefixLadder) and (label_ids is None or self._given is None):
             last = dict.fromkeys(self.labels, self._ladder.levels[-1])
             levels = self._seen(camera, tile_mask, compositions and [*compositions, last])
-            label_ids = levels.label_ids(last)
+            label_ids = levels.label_ids(last) if label_ids is None else label_ids
             image = levels.render(last).copy() if self._given is None else None
         label_ids = self._last.render(camera) if label_ids is None else label_ids
         image = self._full.paint(camera, tile_mask) if image is None else image

@@ -299,26 +299,28 @@ def remove_composition_bias(
     This is no calibration: it brings what is calibrated close to what is asked.
     """
     return {
-        label: _by_place(model, trial, label, _FEW, lambda critical: _empirical(critical, confidence))
+        label: _by_place(
+            model, trial.critical(label), trial.away[trial.views(label)], _FEW,
+            lambda critical: _empirical(critical, confidence),
+        )
         if len(trial.views(label))
         else model
         for label, model in models.items()
-    }
+    }  # fmt: skip
 
 
 def _by_place(
     model: FidelityModel,
-    trial: Trial,
-    label: int,
+    critical: Float[np.ndarray, "G n"],
+    away: Float[np.ndarray, " n"],
     fewest: int,
     asked: Callable[[Float[np.ndarray, "G n"]], Float[np.ndarray, " G"]],
 ) -> FidelityModel:
     """The model with thresholds that go linearly from what viewpoints on the path need to what others do.
 
-    `asked`: what to ask for TARGETS, from the critical nominal targets of some viewpoints. Those of all count
-    together where fewer than `fewest` of either kind show the category.
+    `asked`: what to ask for TARGETS, from the critical nominal targets of some of the viewpoints. All count
+    together where there are fewer than `fewest` of either kind.
     """
-    critical, away = trial.critical(label), trial.away[trial.views(label)]
     sides = [away < _NEAR, away >= _NEAR]
     if min(side.sum() for side in sides) < fewest:
         return _asked(model, asked(critical))
@@ -386,16 +388,17 @@ def calibrated(
         values = np.array([conformal_quantile(values, confidence) for values in critical])
         return np.where(held, np.maximum(values, TARGETS), values)
 
-    asked = {label: conformal(trial.critical(label)) for label in models if len(trial.views(label)) >= fewest}
+    critical = {label: trial.critical(label) for label in models}
+    asked = {label: conformal(found) for label, found in critical.items() if found.shape[1] >= fewest}
     # nothing is known below the last level where not even one category could be calibrated
     widest = np.max([*asked.values()], axis=0) if asked else np.ones(len(TARGETS))
     found = {}
     for label, model in models.items():
-        views = len(trial.views(label))
+        views = critical[label].shape[1]
         if label in asked:
-            made = _by_place(model, trial, label, fewest, conformal)
+            made = _by_place(model, critical[label], trial.away[trial.views(label)], fewest, conformal)
         else:
-            made = _asked(model, np.maximum(widest, trial.critical(label).max(1)) if views else widest)
+            made = _asked(model, np.maximum(widest, critical[label].max(1)) if views else widest)
         status = "calibrated" if label in asked else "uncalibrated"
         least = model.calibration.least_support
         least = min(least, trial.least_support(label)) if views else least

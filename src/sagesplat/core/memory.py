@@ -1,6 +1,5 @@
 """Memory that runs out, in whatever words: Python's, numpy's, torch's, onnxruntime's or the loader's."""
 
-import ctypes
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,12 +33,6 @@ def ran_out(error: BaseException) -> bool:
         return True
     before = error.__cause__ or error.__context__
     return before is not None and ran_out(before)
-
-
-def give_back() -> None:
-    """Return freed memory to the system. glibc keeps much of it: 0.8 GB after a million Gaussians."""
-    if trim := getattr(ctypes.pythonapi, "malloc_trim", None):
-        trim(0)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any
 
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone, StageSkipped, StageStarted
-from sagesplat.core.memory import give_back, named_memory
+from sagesplat.core.memory import named_memory
 from sagesplat.io.files import named_full_disk, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
 from sagesplat.run.job import NO_RUN, Job
@@ -82,7 +82,6 @@ def run_stages(
         begin, since = time.perf_counter(), time.time() - _CLOCK_STEP
         for number, lines in make(missing):
             stage = stages[number]
-            give_back()
             seconds = time.perf_counter() - begin
             sync_changed(job.run.path, since)
             record(job.run, stage.name, stage.settings, stage.inputs, seconds)

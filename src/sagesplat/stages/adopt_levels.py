@@ -74,9 +74,12 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
             check_nest(job, len(g), g.sh_degree)
         ladder, num_lower = _ladder(job, g, shares, config, checkpoint_key(run, settings, inputs))
         ladder, label_of = in_cells(ladder, cells_wanted(len(g)))
-        made, replaces = _streams(job, ladder, label_of, g, config.lossless), ladder.replaces
+        rows, space = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace()
+        came_in = [(row, _image(job, g, row, space)) for row in rows]
+        precision = None if config.lossless else _precision(job, g, came_in)
+        made, replaces = _streams(job, ladder, label_of, precision), ladder.replaces
         del ladder  # of millions of Gaussians: what is read back takes as much
-        lines = _prefixes(job, made, replaces, label_of, num_lower, g, settings)
+        lines = _prefixes(job, made, replaces, label_of, num_lower, came_in, settings)
         remove_checkpoints(run.nest_checkpoint)
         return lines
 
@@ -201,25 +204,18 @@ def _trained(
 
 
 def _streams(
-    job: Job, ladder: Assembled, label_of: Mapping[int, int], before: Gaussians, lossless: bool
+    job: Job, ladder: Assembled, label_of: Mapping[int, int], precision: Precision | None
 ) -> Streams:
     """Write the increments of a ladder.
 
-    Levels of the originals are exact, or rounded as finely as they need to look the same. Those below are
-    rounded as trained levels are.
+    Levels of the originals have a precision, or are exact (None). Those below are rounded as trained levels
+    are.
     """
     job.run.provenance("nest").unlink(missing_ok=True)  # from here on the earlier ladder is gone
-    last = None if lossless else _precision(job, before, _targets(job, before))
     return write_streams(
         job.run.increments, ladder.gaussians, ladder.sizes, job.names(), label_of=label_of,
-        replaces=ladder.replaces, last=last, antialiased=job.antialiased,
+        replaces=ladder.replaces, last=precision, antialiased=job.antialiased,
     )  # fmt: skip
-
-
-def _targets(job: Job, before: Gaussians) -> list[tuple[int, np.ndarray]]:
-    """Images of what came in, by view."""
-    rows, space = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace()
-    return [(row, _image(job, before, row, space)) for row in rows]
 
 
 def _prefixes(
@@ -228,16 +224,18 @@ def _prefixes(
     replaces: Mapping[int, tuple[int, ...]],
     label_of: Mapping[int, int],
     num_lower: int,
-    before: Gaussians,
+    came_in: Sequence[tuple[int, np.ndarray]],
     settings: dict[str, Any],
 ) -> list[str]:
-    """Write the ladder as its increments show it; `num_lower` of the levels are not of the originals."""
+    """Write the ladder as its increments show it; `num_lower` of the levels are not of the originals.
+
+    `came_in`: images of what came in, by view.
+    """
     run, levels, lossless = job.run, len(next(iter(made.sizes.values()))), settings["lossless"]
-    targets = _targets(job, before)
     sent = read_increments(run.increments, made.increments)
     write_set(run.prefixes, sent, settings["steps"], made.sizes, replaces=replaces, exact=True)
     top = NestedLadder(read_prefixes(run.prefixes), dict(label_of)).load(levels)
-    ssim, decibels = _kept(job, top, targets)
+    ssim, decibels = _kept(job, top, came_in)
     if not lossless and (other := sum(one.format != "stream" for one in made.increments)):
         job.emit(Warned(f"{other} files are PLY: some of their Gaussians lie too far off to be rounded"))
     write_cells(run.cells, describe_cells(sent, dict(label_of)))

@@ -32,7 +32,7 @@ from sagesplat.stages.methods import method_of
 
 VIEWS = (100, 200, 400)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.05  # at least this share
-DEFAULT_COUNTS = {"fit": 400, "bias": 90, "calibration": 150}  # as many as the training's time allows;
+DEFAULT_COUNTS = {"fit": VIEWS[-1], "bias": 90, "calibration": 150}  # as many as the training's time allows;
 MOST = {"fit": VIEWS[-1], "bias": 90, "calibration": 300}  # after a long training up to these, by
 _EXTRA = 0.25  # this share of its time: they make bounds a little tighter, no more
 _RENDERS = 4.0  # a training step: sampling and fitting take 0.9 of the demo's training, 0.4 with nesting
