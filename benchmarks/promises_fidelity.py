@@ -1,8 +1,9 @@
 """Coverage of fidelity bounds at fresh viewpoints, and plans beside equal levels of the same bytes."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from sagesplat.adapt.fidelity import SampledFidelity, shown_enough
 from sagesplat.adapt.fidelity_models import plan_nominal
 from sagesplat.adapt.viewpoints import capture_cameras, draw
 from sagesplat.run.job import Job
+from sagesplat.scene.scene import Camera
 from sagesplat.stages.fidelity import compositions_at
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import plans_of, viewpoints_of
@@ -20,10 +22,23 @@ from sagesplat.stages.sample import measured_levels
 
 TARGETS = (0.8, 0.9, 0.95, 0.98)
 MORE_TARGETS = (0.5, 0.6, 0.7, 0.75, 0.85, 0.97, 0.99)  # of the curve of plans over bytes
-# places (path, walk, back) and screens of the viewpoints
-CONDITIONS: dict[str, tuple[tuple[float, float, float], float]] = {
-    "path": ((1, 0, 0), 1.0), "path, half the pixels": ((1, 0, 0), 0.5),
-    "path, twice the pixels": ((1, 0, 0), 2.0), "walk": ((0, 1, 0), 1.0), "back": ((0, 0, 1), 1.0),
+
+
+class Condition(NamedTuple):
+    """What viewpoints have in common."""
+
+    places: tuple[float, float, float]  # path, walk, back
+    screen: float
+    lens: tuple[float, float] | None = None  # width over height, and degrees of the shorter side; None: drawn
+
+
+CONDITIONS = {
+    "path": Condition((1, 0, 0), 1.0), "path, half the pixels": Condition((1, 0, 0), 0.5),
+    "path, twice the pixels": Condition((1, 0, 0), 2.0), "walk": Condition((0, 1, 0), 1.0),
+    "back": Condition((0, 0, 1), 1.0),
+    "path, window of 60 degrees": Condition((1, 0, 0), 2.0, (16 / 9, 60.0)),
+    "path, headset of 90 degrees": Condition((1, 0, 0), 1.0, (1.0, 90.0)),
+    "walk, headset of 90 degrees": Condition((0, 1, 0), 1.0, (1.0, 90.0)),
 }  # fmt: skip
 _DRAWS = 1000  # bootstrap
 
@@ -88,9 +103,11 @@ def by_condition(job: Job, views: int = 200, seed: int = 91_000) -> dict[str, An
     """
     method, rule, names = NestedLevels(job), viewpoints_of(job).rule, job.names()
     labels, costs, targets, found = list(method.costs.labels), method.cell_costs, np.array(TARGETS), {}
-    for name, (places, screen) in CONDITIONS.items():
-        drawn = replace(rule, seed=rule.seed + seed, places=places, screens=(screen, screen))
+    for name, (places, screen, lens) in CONDITIONS.items():
+        fov = 1.0 if lens else rule.fov  # without a lens, as sharp as asked
+        drawn = replace(rule, seed=rule.seed + seed, places=places, screens=(screen, screen), fov=fov)
         cameras = draw(job.scene, capture_cameras(job.scene), drawn, {"test": views}).cameras
+        cameras = [through(camera, *lens) for camera in cameras] if lens else cameras
         expected = method.expect(cameras)
         planned = plan_nominal(method.fidelity, expected, costs.transfer_bytes, targets)
         got, pixels = compositions_at(
@@ -112,6 +129,14 @@ def by_condition(job: Job, views: int = 200, seed: int = 91_000) -> dict[str, An
             }  # fmt: skip
         found[name] = rows
     return found
+
+
+def through(camera: Camera, ratio: float, fov: float) -> Camera:
+    """The camera with a picture of a ratio of width to height, and degrees of its shorter side."""
+    shorter = 2 * math.tan(math.radians(fov) / 2) * camera.focal
+    width, height = round(shorter * max(ratio, 1)), round(shorter * max(1 / ratio, 1))
+    K = np.array([[camera.focal, 0, width / 2], [0, camera.focal, height / 2], [0, 0, 1]], np.float32)
+    return replace(camera, K=K, width=width, height=height)
 
 
 def _equal(job: Job, views: int) -> np.ndarray:

@@ -22,17 +22,15 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt.cell_models import CellModel, FidelityModel, expect, promised
+from sagesplat.adapt.cell_models import CellModel, FidelityModel, expect, promised, views_of
 from sagesplat.adapt.cells import POINTS, STEPS, Cells, label_distances, look
 from sagesplat.adapt.eq3 import Eq3, SsimModel
-from sagesplat.adapt.process import inputs_of
 from sagesplat.adapt.viewpoint import (
     NO_CALIBRATION,
     PHOTOS_ONLY,
     Calibration,
     QualityKind,
     ViewModel,
-    where,
 )
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer.frames import FLIP, camera_at
@@ -143,7 +141,7 @@ def model(seed: int, views: int, levels: list[int], *, unseen: bool = True) -> V
         median_log_distance=float(rng.uniform(0.3, 1.2)),
         focal=FOCAL,
         screens=PHOTOS_ONLY,
-        inputs=np.column_stack([position, direction, np.zeros(views), rng.normal(0.8, 0.4, views)]),
+        inputs=np.column_stack([position, direction, np.zeros((views, 2)), rng.normal(0.8, 0.4, views)]),
         heldout_inputs=(np.arange(views) % 5 == 2) & unseen,
         lengths=tuple(rng.uniform(0.2, 1.2, 4).tolist()),  # pyright: ignore[reportArgumentType]
         heldout_variance=float(rng.uniform(0, 0.4)) * unseen,
@@ -159,9 +157,7 @@ def fidelity_models(
 ) -> dict[int, FidelityModel]:
     """A model of fidelity for each category; every third cell has no views, and every fourth few factors."""
     rng, found = np.random.default_rng(seed), {}
-    position, direction, screen = where(cameras, FOCAL)
-    ones = np.ones(len(cameras))
-    views = inputs_of(ones, position, direction, EXTENT, 0.0, np.clip(screen, *SCREENS))[:, :7]
+    views = views_of(cameras, EXTENT, FOCAL, SCREENS)
     for label in np.unique(cells.labels).tolist():
         made = []
         for i, cell in enumerate(cells.ids[cells.labels == label].tolist()):
@@ -246,7 +242,7 @@ def _ssim_case(name: str, made: ViewModel, seed: int, stored: Mapping[str, Case]
         position[i] = made.inputs[0, :3] * made.extent + 0.05 * i
         direction[i] = made.inputs[0, 3:6]
     position[1] = 1e3  # far from all
-    away = np.array([math.exp(made.inputs[0, 7]), 2.0, math.nan, 2.1, 1.9999, 50.0])
+    away = np.array([math.exp(made.inputs[0, -1]), 2.0, math.nan, 2.1, 1.9999, 50.0])
     screen = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 0.1])
     told = sent.predict(away, position, direction, screen)
     right = sent.corrected(away, position, direction)

@@ -32,7 +32,7 @@ FOCAL = orbit(1)[0].focal
 def model(label: int, calibration: Calibration = NO_CALIBRATION) -> ViewModel:
     """Fidelity 0.6, 0.8 and 1 everywhere; known at the origin, looking along z."""
     curves = tuple(constant_curve(label, k + 1, v, 0.0, 1) for k, v in enumerate((0.6, 0.8, 1.0)))
-    x = np.array([[0, 0, 0, 0, 0, 1, 0, 0]], float)
+    x = np.array([[0, 0, 0, 0, 0, 1, 0, 0, 0]], float)
     return ViewModel(
         label, "fidelity", curves, 1.0, 0.0, FOCAL, (0.5, 2.0), x, np.zeros(1, bool), (1.0, 1.0, 1.0, 1.0),
         0.0, np.zeros((6, 0)), np.zeros((1, 3)), 0.0, calibration,

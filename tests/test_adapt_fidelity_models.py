@@ -333,11 +333,11 @@ def test_photos_of_a_large_capture_are_thinned_and_still_cover_it():
     cameras = viewpoints(600, 3)
     places = photo_places(cameras, 2.0)
     assert places.shape == (6, MOST_PHOTOS)
-    every = np.column_stack([places.T, np.zeros((MOST_PHOTOS, 2))])
+    every = np.column_stack([places.T, np.zeros((MOST_PHOTOS, 3))])
     known = {tuple(np.round(row, 6)) for row in photo_places(cameras[:MOST_PHOTOS], 2.0).T}
     assert len(known) == MOST_PHOTOS  # none is left out of so many
     at = where(cameras, 1.0)
-    x = np.column_stack([at.position / 2.0, at.direction, np.zeros((600, 2))])
+    x = np.column_stack([at.position / 2.0, at.direction, np.zeros((600, 3))])
     nowhere = np.zeros(600)
     thinned = away_from(x, places, nowhere)
     some = away_from(x, places[:, ::8], nowhere)

@@ -20,7 +20,7 @@ from sagesplat.adapt.process import (
 
 def drawn(n: int = 20, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return rng.standard_normal((n, 8)), np.arange(n) % 3 == 0, 0.1 * rng.standard_normal((n, 2))
+    return rng.standard_normal((n, 9)), np.arange(n) % 3 == 0, 0.1 * rng.standard_normal((n, 2))
 
 
 def squares_of(x: np.ndarray) -> list[np.ndarray]:
@@ -124,7 +124,7 @@ def test_an_unknown_distance_counts_as_the_median():
     distance = np.array([2.0, np.nan, 0.0, -1.0, np.inf])
     where = np.zeros((5, 3)), np.ones((5, 3))
     x = inputs_of(distance, *where, 2.0, 0.7)
-    np.testing.assert_allclose(x[:, 7], [np.log(2), 0.7, 0.7, 0.7, 0.7])
+    np.testing.assert_allclose(x[:, 8], [np.log(2), 0.7, 0.7, 0.7, 0.7])
     np.testing.assert_array_equal(x[:, 6], 0)  # no screen: the photos'
     screens = inputs_of(distance, *where, 2.0, 0.7, np.full(5, 2.0))
     np.testing.assert_allclose(screens[:, 6], np.log(2))

@@ -40,7 +40,7 @@ def test_formulas_of_the_module_text(model):
     """What a viewer computes from promises.json, written out for one viewpoint."""
     entry = json.loads(json.dumps(to_plain(model)))
     distance, position, direction = viewpoints(SCENE, SCENE.test_ids[:1])
-    x = np.array([*position[0] / entry["extent"], *direction[0], 0.0, np.log(distance[0])])
+    x = np.array([*position[0] / entry["extent"], *direction[0], 0.0, 0.0, np.log(distance[0])])
     X, u = np.array(entry["inputs"]), np.array(entry["heldout_inputs"], float)
 
     def c(a, b):

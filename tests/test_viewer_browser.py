@@ -159,8 +159,9 @@ def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("promised")
     contents = three_walls(folder)
     cameras = [entry.camera for entry in contents.cameras]
-    position, direction, screen = where(cameras, camera().focal)
+    position, direction, screen, field = where(cameras, camera().focal)
     views = inputs_of(np.full(len(cameras), 5.0), position, direction, 1.0, 0.0, screen)
+    through = inputs_of(np.full(len(cameras), 5.0), position, direction, 1.0, 0.0, screen, field)
     seen = Seen(np.full(len(cameras), 0.3), np.full(len(cameras), 5.0))
 
     def usual(label: int, quality: QualityKind) -> Calibration:
@@ -182,7 +183,7 @@ def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
             np.zeros((4, 0)), np.full(len(views), -1.0),
         )  # fmt: skip
         return FidelityModel(
-            label, 1.0, camera().focal, SCREENS, views[:, :7], LENGTHS, views[:, :6].T, (cell,), 0.0,
+            label, 1.0, camera().focal, SCREENS, through[:, :-1], LENGTHS, views[:, :6].T, (cell,), 0.0,
             usual(label, "fidelity"),
         )  # fmt: skip
 

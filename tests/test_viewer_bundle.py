@@ -144,7 +144,7 @@ def test_curves_keep_what_they_say(seed: int) -> None:
 def own_views(made: ViewModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Distance, position, direction and screen of a model's views."""
     inputs = made.inputs
-    distance = np.exp(inputs[:, 7]) * (1 + 1e-9)  # a curve may jump exactly there
+    distance = np.exp(inputs[:, -1]) * (1 + 1e-9)  # a curve may jump exactly there
     return distance, inputs[:, :3] * made.extent, inputs[:, 3:6], np.exp(inputs[:, 6])
 
 
@@ -408,8 +408,8 @@ def test_promises_know_the_model_s_views_and_shares(contents) -> None:
     assert (promises["focal"], promises["screens"]) == (made.focal, list(made.screens))
     assert len(views) == made.num_views  # the test photo taught nothing
     assert np.cumsum(whole["shares"]).tolist() == [2500] * len(views)
-    inputs = read_model(promises, 3).inputs[:, :7].round(3)
-    wanted = sorted(map(tuple, made.inputs[:, :7].round(3).tolist()))
+    inputs = read_model(promises, 3).inputs[:, :-1].round(3)
+    wanted = sorted(map(tuple, made.inputs[:, :-1].round(3).tolist()))
     np.testing.assert_allclose(sorted(map(tuple, inputs.tolist())), wanted, atol=2e-3)
 
 

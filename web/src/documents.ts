@@ -186,8 +186,8 @@ export interface Promises {
   focal: number;
   /** Screens that promises are for, from and to; others count as the nearer end. */
   screens: [number, number];
-  /** By axis (x y z over the extent, direction, log screen) and view, in 1/10000. */
-  views: [Steps, Steps, Steps, Steps, Steps, Steps, Steps];
+  /** By axis (x y z over the extent, direction, log screen, log field) and view, in 1/10000. */
+  views: [Steps, Steps, Steps, Steps, Steps, Steps, Steps, Steps];
   /** Photos that thresholds rise away from, as views without a screen. None: the views of a label. */
   photos: [Steps, Steps, Steps, Steps, Steps, Steps];
   labels: LabelPromises[];
@@ -199,7 +199,7 @@ export interface LabelPromises {
   confidence: number;
   /** Below it there is no bound. */
   leastSupport: number;
-  /** Length scales of position, direction, log screen, log distance. */
+  /** Length scales of position, direction, log screen and log field, log distance. */
   lengths: [number, number, number, number];
   targets: Steps;
   thresholds: Steps;

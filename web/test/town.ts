@@ -90,12 +90,14 @@ function part(
   return cellOf(id, [a, 0, b, a + 6, 1 + 2 * random(), b + 6], levels);
 }
 
+const LOG_FIELD = 0.2; // about that of the visitor's lens
+
 /** Each cell is known from views in and around its block. */
 function promisesOf(labels: readonly Label[], side: number, views: number, random: () => number): Promises {
   const all = Array.from({ length: side * side * views }, () => {
     const turn = 2 * Math.PI * random();
     const [x, z] = [SIDE * side * random(), SIDE * side * random()];
-    return [x, 1.5, z, Math.sin(turn), 0, Math.cos(turn), 0] as const;
+    return [x, 1.5, z, Math.sin(turn), 0, Math.cos(turn), 0, LOG_FIELD] as const;
   });
   const extent = SIDE * side;
   const column = (axis: number) =>
@@ -105,7 +107,7 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
     extent,
     focal: FOCAL,
     screens: [0.5, 2],
-    views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6)],
+    views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6), column(7)],
     photos: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) => {
       const models = label.cells.map(({ id, bounds: [x, , z] }) => {

@@ -274,8 +274,10 @@ export function modelOf(
   };
 }
 
+const LOG_FIELD = 0.5 * Math.log(4 * 0.8 * 0.5); // of `at`'s lens
+
 function promisesOf(labels: readonly Label[], random: () => number): Promises {
-  const views = Array.from({ length: 12 }, () => [10 * random() - 5, 0, 4 * random(), 0, 0, -1, 0]);
+  const views = Array.from({ length: 12 }, () => [10 * random() - 5, 0, 4 * random(), 0, 0, -1, 0, LOG_FIELD]);
   const rows = views.map((_, i) => i);
   const column = (axis: number) =>
     differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1)));
@@ -284,7 +286,7 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
     extent: 5,
     focal: FOCAL,
     screens: [0.5, 2],
-    views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6)],
+    views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6), column(7)],
     photos: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) =>
       modelsOf(

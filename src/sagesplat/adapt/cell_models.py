@@ -66,7 +66,7 @@ class FidelityModel:
     extent: Positive  # of the scene, world units
     focal: Positive  # of the photos, pixels: what screens are measured by
     screens: tuple[Positive, Positive]  # from and to; what lies outside counts as the end of it
-    views: Float[np.ndarray, "V 7"]  # position / extent, direction, log screen
+    views: Float[np.ndarray, "V 8"]  # position / extent, direction, log screen, log field
     lengths: tuple[Positive, Positive, Positive, Positive]  # of the groups of inputs
     photos: Float[np.ndarray, "6 P"]  # position / extent and direction of photos
     cells: tuple[CellModel, ...]  # ascending
@@ -162,17 +162,24 @@ def expect(
     return Expected(cells.ids, labels, column, mean, share, sight.distance, support, away)
 
 
-def inputs_at(model: FidelityModel, cameras: Sequence[Camera]) -> Float[np.ndarray, "V 7"]:
+def inputs_at(model: FidelityModel, cameras: Sequence[Camera]) -> Float[np.ndarray, "V 8"]:
     """The inputs of viewpoints without distances."""
-    position, direction, screen = where(cameras, model.focal)
-    inside = np.clip(screen, *model.screens)
-    return inputs_of(np.ones(len(cameras)), position, direction, model.extent, 0.0, inside)[:, :7]
+    return views_of(cameras, model.extent, model.focal, model.screens)
+
+
+def views_of(
+    cameras: Sequence[Camera], extent: float, focal: float, screens: tuple[float, float]
+) -> Float[np.ndarray, "V 8"]:
+    """`FidelityModel.views` of cameras."""
+    position, direction, screen, field = where(cameras, focal)
+    screen = np.clip(screen, *screens)
+    return inputs_of(np.ones(len(cameras)), position, direction, extent, 0.0, screen, field)[:, :-1]
 
 
 def cell_means(
     model: FidelityModel,
     cell: CellModel,
-    known: Float[np.ndarray, "V 7"],
+    known: Float[np.ndarray, "V 8"],
     distance: Float[np.ndarray, " V"],
 ) -> Float[np.ndarray, "V K"]:
     """The mean of a cell's levels at viewpoints with these inputs and distances."""

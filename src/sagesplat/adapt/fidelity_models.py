@@ -27,11 +27,19 @@ from sagesplat.adapt.calibrate import (
     critical_nominals,
     fewest_views,
 )
-from sagesplat.adapt.cell_models import CellModel, Expected, FidelityModel, factors_of, needed, promised
+from sagesplat.adapt.cell_models import (
+    CellModel,
+    Expected,
+    FidelityModel,
+    factors_of,
+    needed,
+    promised,
+    views_of,
+)
 from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.cells import Cells, Sight, look
 from sagesplat.adapt.fidelity import SampledFidelity
-from sagesplat.adapt.process import fit_together, inputs_of, matern32
+from sagesplat.adapt.process import fit_together, matern32
 from sagesplat.adapt.viewpoint import PHOTO_LENGTHS, Calibration, Status, away_from, monotone, where
 from sagesplat.scene.scene import Camera
 
@@ -87,9 +95,7 @@ def fit_fidelity(
     Returns:
         Models by label id; a category that is shown in no viewpoint has none. They are not calibrated yet.
     """
-    position, direction, screen = where(cameras, focal)
-    inside = np.clip(screen, *screens)
-    views = inputs_of(np.ones(len(cameras)), position, direction, extent, 0.0, inside)[:, :7]
+    views = views_of(cameras, extent, focal, screens)
     sight, places = look(cells, cameras), photo_places(photos, extent)
     inducing = _farthest(views, MOST_INDUCING, (*PHOTO_LENGTHS, 1.0))
     whole = sampled.by_label(cells.label_of)
@@ -119,7 +125,7 @@ class _Part:
 def _fit(
     label: int,
     part: _Part,
-    views: Float[np.ndarray, "V 7"],
+    views: Float[np.ndarray, "V 8"],
     inducing: Int[np.ndarray, " M"],  # rows of the views that stay in the model
     category: Float[np.ndarray, "n K"],  # fidelity in the rows that show it
     rows: Int[np.ndarray, " n"],
@@ -155,7 +161,7 @@ def _fit(
         found = sampled.fidelity[own, column].astype(np.float64)
         found[:, learnt] = offsets[i][learnt] + process.left_out[i]
         left_out[own, column] = monotone(found)
-        log, row, v = inputs[i][kept, 7], np.searchsorted(inducing, own[kept]), factors[inducing, column]
+        log, row, v = inputs[i][kept, -1], np.searchsorted(inducing, own[kept]), factors[inducing, column]
         cells.append(CellModel(part.ids[i], offsets[i], row, log, medians[i], weights.T, v))
     # the category at equal levels, from its cells without the view
     weight = np.where(np.isnan(left_out[:, part.columns, 0]), 0, shares[:, part.columns])[rows]
@@ -191,7 +197,7 @@ def _fit(
 
 def photo_places(photos: Sequence[Camera], extent: float) -> Float[np.ndarray, "6 P"]:
     """`ViewModel.photos` of cameras, at most `MOST_PHOTOS`."""
-    position, direction, _ = where(photos, 1.0)
+    position, direction, *_ = where(photos, 1.0)
     places = np.column_stack([position / extent, direction])
     return places[_farthest(places, MOST_PHOTOS, PHOTO_LENGTHS)].T
 

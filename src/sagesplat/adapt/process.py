@@ -2,8 +2,9 @@
 
 One kernel serves all levels, only its amplitude differs:
 
-    x        = (position / extent, direction, log screen, log distance): 8 numbers, 4 groups with a length
-               scale each; screen: the viewer's focal length in pixels over the photos'
+    x        = (position / extent, direction, log screen, log field, log distance): 9 numbers, 4 groups with a
+               length scale each, screen and field together; screen: the viewer's focal length in pixels over
+               the photos'; field: root of the picture's area, at distance 1
     a(x, x') = sqrt(3 * sum over the groups of |x - x'|^2 / length^2)
     c(x, x') = (1 + a) exp(-a)                                        Matern 3/2
     S_ij     = c(x_i, x_j) + heldout_variance * u_i * u_j + noise * [i = j]
@@ -30,8 +31,8 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-# of the inputs: position, direction, log screen, log distance
-GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 8))
+# of the inputs: position, direction, log screen and log field, log distance
+GROUPS = (slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 9))
 # logs of the hyperparameters (lengths of GROUPS; heldout variance and noise over the amplitude's square):
 # where they are sought, one standard deviation of the prior, and the bounds in standard deviations
 PRIOR = np.log([0.3, 0.5, 1.0, 0.5, 0.1, 0.1])
@@ -59,12 +60,13 @@ def inputs_of(
     extent: float,
     median_log_distance: float,
     screen: Float[np.ndarray, " V"] | None = None,
-) -> Float[np.ndarray, "V 8"]:
-    """The inputs x of viewpoints; unknown distances (NaN) count as the median, no screen as the photos'."""
+    field: Float[np.ndarray, " V"] | None = None,
+) -> Float[np.ndarray, "V 9"]:
+    """The inputs x of viewpoints; unknown distances (NaN) count as the median, no screen or field as 1."""
     known = np.isfinite(distance) & (distance > 0)
     log_distance = np.where(known, np.log(np.where(known, distance, 1.0)), median_log_distance)
-    log_screen = np.zeros(len(distance)) if screen is None else np.log(screen)
-    return np.column_stack([position / extent, direction, log_screen, log_distance]).astype(np.float64)
+    logs = [np.zeros(len(distance)) if value is None else np.log(value) for value in (screen, field)]
+    return np.column_stack([position / extent, direction, *logs, log_distance]).astype(np.float64)
 
 
 def matern32(
@@ -86,12 +88,12 @@ class Together:
 
 
 def fit_process(
-    x: Float[np.ndarray, "n 8"], heldout: Bool[np.ndarray, " n"], values: Float[np.ndarray, "n K"]
+    x: Float[np.ndarray, "n 9"], heldout: Bool[np.ndarray, " n"], values: Float[np.ndarray, "n K"]
 ) -> Process:
     """Fit a process of zero mean to values at n >= 1 viewpoints and K levels.
 
     Args:
-        x: [n, 8], inputs (`inputs_of`).
+        x: [n, 9], inputs (`inputs_of`).
         heldout: [n], whether training never saw the view.
         values: [n, K], what the levels' means leave.
 

@@ -122,7 +122,7 @@ class ViewModel:
     median_log_distance: Number  # log distance, for viewpoints that know none
     focal: Positive  # of the photos, pixels: what screens are measured by
     screens: tuple[Positive, Positive]  # from and to; what lies outside counts as the end of it
-    inputs: Float[np.ndarray, "n 8"]  # of the views behind it: position / extent, direction, log s, log d
+    inputs: Float[np.ndarray, "n 9"]  # of the views behind it: position / extent, direction, log s, 0, log d
     heldout_inputs: Bool[np.ndarray, " n"]  # photos that training never saw; of fidelity none
     lengths: tuple[Positive, Positive, Positive, Positive]  # of the groups of inputs
     heldout_variance: NotNegative  # over the variance of the process
@@ -192,29 +192,32 @@ class ViewModel:
         position: Float[np.ndarray, "V 3"],
         direction: Float[np.ndarray, "V 3"],
         screen: Float[np.ndarray, " V"] | None = None,
-    ) -> Float[np.ndarray, "V 8"]:
+    ) -> Float[np.ndarray, "V 9"]:
         """The inputs of viewpoints, as of `predict`."""
         screen = None if screen is None else np.clip(screen, *self.screens)
         return inputs_of(distance, position, direction, self.extent, self.median_log_distance, screen)
 
 
 class Where(NamedTuple):
-    """Where V cameras are, as `ViewModel.predict` takes it after the distance."""
+    """What models know of V cameras; all but the field as `ViewModel.predict` takes it after the distance."""
 
     position: Float[np.ndarray, "V 3"]  # world
     direction: Float[np.ndarray, "V 3"]
     screen: Float[np.ndarray, " V"]
+    field: Float[np.ndarray, " V"]  # root of the picture's area, at distance 1
 
 
 def where(cameras: Sequence[Camera], focal: float) -> Where:
     """Of cameras, by the photos' focal length in pixels."""
     position = np.array([camera.position for camera in cameras], np.float64).reshape(-1, 3)
     direction = np.array([camera.direction for camera in cameras], np.float64).reshape(-1, 3)
-    return Where(position, direction, np.array([camera.focal for camera in cameras], np.float64) / focal)
+    own = np.array([camera.focal for camera in cameras], np.float64)
+    pixels = np.array([camera.width * camera.height for camera in cameras], np.float64)
+    return Where(position, direction, own / focal, np.sqrt(pixels) / own)
 
 
 def away_from(
-    x: Float[np.ndarray, "V 8"], photos: Float[np.ndarray, "6 P"], support: Float[np.ndarray, " V"]
+    x: Float[np.ndarray, "V 9"], photos: Float[np.ndarray, "6 P"], support: Float[np.ndarray, " V"]
 ) -> Float[np.ndarray, " V"]:
     """How far viewpoints, given by their inputs, are from the photos: 0 at one of them, 1 far from all.
 

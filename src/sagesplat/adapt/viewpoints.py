@@ -14,8 +14,10 @@ The rule, for each viewpoint by itself:
    half as far as from both cameras, or as from all but a tenth of the cameras. After 50 draws the camera
    itself is taken.
 3. Choose a screen: its focal length in pixels is `s` times the camera's, log-uniform in `screens`, its size
-   as well. Half of them have another shape of the same area: the ratio of the sides is log-uniform from
-   portrait to landscape phones.
+   as well. Half of them have another shape and lens: the ratio of the sides is log-uniform from portrait to
+   landscape phones, the shorter side log-uniform from that of a picture of the same area to one that takes
+   in `fov` degrees. None has more than three times the pixels of a photo on the sharpest screen: `s` is then
+   smaller.
 
 All draws are independent of each other, so those that nothing is fitted to are exchangeable with those of a
 visitor who moves as the rule says.
@@ -35,7 +37,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sagesplat.adapt.free_poses import looking
 from sagesplat.core.errors import RunError
 from sagesplat.core.geometry import NO_OFFSET, Position, less_offset
-from sagesplat.core.limits import Count, Positive, Screen, Seed, Share
+from sagesplat.core.limits import Count, Fov, Positive, Screen, Seed, Share
 from sagesplat.io.files import read_json, write_json
 from sagesplat.io.typed import check_limits, convert_as, read_json_as, refused
 from sagesplat.scene.cameras import MOST_PIXELS, VIEWPOINTS, ViewpointsFile
@@ -53,6 +55,7 @@ _RISE = 0.1  # of the extent, from the height of a camera
 _SHAPED = 0.5  # of the viewpoints have another shape than the photos
 LONGEST = 20 / 9  # of the sides of a picture, the longer over the shorter
 _RATIOS = np.log([9 / 20, LONGEST])  # of width to height
+_MORE_PIXELS = 3  # that a picture may have than a photo on the sharpest screen
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ class Rule:
     turn: Annotated[float, Meta(ge=0, le=LARGEST_TURN)] = 0.05  # radians
     screens: tuple[Screen, Screen] = (0.5, 2.0)  # focal length in pixels over the camera's, from and to
     places: tuple[Share, Share, Share] = (0.4, 0.4, 0.2)  # of PLACES
+    fov: Fov = 100.0  # widest lens: degrees of the picture's shorter side; photos may be wider
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +145,7 @@ def in_words(drawn: Viewpoints) -> str:
     places = ("on the capture's path", "walking among its cameras", "stepping back from them")
     where = [f"{share:.0%} {place}" for share, place in zip(shares, places, strict=True) if share > 0]
     screens = f"screens of {low:g} to {high:g} times the photos' focal length of {drawn.focal:.0f} pixels"
-    return f"{screens}; viewpoints: {', '.join(where)}"
+    return f"{screens}; lenses up to {drawn.rule.fov:g} degrees; viewpoints: {', '.join(where)}"
 
 
 def capture_cameras(scene: Scene) -> list[Camera]:
@@ -227,10 +231,14 @@ class _Sampler:
         """The camera on a screen of the rule."""
         s = float(np.exp(rng.uniform(*np.log(self.rule.screens))))
         shaped, ratio = rng.uniform() < _SHAPED, float(np.exp(rng.uniform(*_RATIOS)))
-        size = np.array([camera.width, camera.height])
-        side = float(np.sqrt(size.prod()))
-        new = np.array([side * ratio**0.5, side * ratio**-0.5]) if shaped else size
-        new = np.maximum(np.round(s * new), 1).astype(int)
+        size = np.array([camera.width, camera.height], np.float64)
+        if shaped:
+            same = math.sqrt(size.prod()) * np.array([ratio**0.5, ratio**-0.5])
+            widest = 2 * math.tan(math.radians(self.rule.fov) / 2) * camera.focal / same.min()
+            new = same * max(widest, 1) ** rng.uniform()
+            most = min(_MORE_PIXELS * self.rule.screens[1] ** 2 * size.prod(), MOST_PIXELS)
+            size, s = new, min(s, math.sqrt(most / new.prod()))
+        new = np.maximum(np.round(s * size), 1).astype(int)
         K = camera.K.astype(np.float64)
         K[:2] *= s
         if shaped:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from sagesplat.core.limits import NotNegative, Screen, Seed, Share, SomeShare
+from sagesplat.core.limits import Fov, NotNegative, Screen, Seed, Share, SomeShare
 
 _MOST = 2**31 - 1
 Int31 = Annotated[int, Meta(ge=0, le=_MOST)]  # steps, views, pixels
@@ -232,7 +232,7 @@ class AdoptConfig:
     """How viewpoints are drawn. object: on orbits around it; place: where one can stand in it."""
     up: str = "auto"
     """Up direction of the viewpoints: x, -x, y, -y, z or -z (auto: from the geometry)."""
-    fov: Annotated[float, Meta(ge=1, le=150)] = 60.0
+    fov: Fov = 60.0
     """Field of view of the longer side of drawn viewpoints, degrees."""
     size: tuple[Side, Side] = (512, 384)
     """Width and height of drawn viewpoints, pixels."""
@@ -263,6 +263,9 @@ class SampleConfig:
     """Screens that promises are for, from and to: the viewer's focal length in pixels over the photos'."""
     places: tuple[Share, Share, Share] = (0.4, 0.4, 0.2)
     """Shares of the viewpoints: on the capture's path, walking among its cameras, stepping back from them."""
+    fov: Fov = 100.0
+    """Widest lens that promises are for: field of view of the picture's shorter side, degrees. The default is
+    that of a headset's eye; half of the viewpoints have lenses between the photos' and this."""
 
 
 @dataclass(frozen=True)
@@ -372,7 +375,7 @@ class MeasureConfig:
     """Up direction for drawn viewpoints: x, -x, y, -y, z or -z (auto: the normal of a floor, or -y)."""
     kind: Literal["auto", "object", "place"] = "auto"
     """Draw viewpoints around an object, or inside of a place (auto: by the free space)."""
-    fov: Annotated[float, Meta(ge=1, le=150)] = 60.0
+    fov: Fov = 60.0
     """Field of view of drawn viewpoints along the longer side, degrees."""
     size: Annotated[int, Meta(ge=16, le=8192)] = 512
     """Longer side of the images, px; those of a file are made no larger."""

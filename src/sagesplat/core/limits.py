@@ -13,6 +13,7 @@ NotNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 SomeShare = Annotated[float, Meta(gt=0, le=1)]
+Fov = Annotated[float, Meta(ge=1, le=150)]  # degrees
 Screen = Annotated[float, Meta(ge=0.01, le=100)]  # focal length in pixels over the photos'
 
 if TYPE_CHECKING:

@@ -52,7 +52,8 @@ from sagesplat.stages.shared import distances_from, label_named, observed
 from sagesplat.stages.snapshots import Snapshots
 from sagesplat.stages.viewpoints import fit_viewpoints
 
-_RAISES = 6  # times that a plan is measured in its composition, and its failing levels raised
+_RAISES = 6  # times that a plan is measured in its composition, and its failing levels raised,
+_VIEWPOINTS = 128  # at so many viewpoints
 
 
 class NestedLevels(Method):
@@ -218,7 +219,7 @@ class NestedLevels(Method):
         """See `Method`: those for fidelity are measured at drawn viewpoints, and raised."""
         plans = [self.plan_scene(target, share, quality) for quality, target in targets]
         drawn, mean_and_pixels = viewpoints_of(self.job), pooled(*self.sampled)
-        cameras = [drawn.cameras[row] for row in drawn.rows("bias", "calibration")]
+        cameras = [drawn.cameras[row] for row in drawn.rows("bias", "calibration")[:_VIEWPOINTS]]
         fewer = self._thinned(plans, share, cameras)
         plans = [fewer.get(i, plan) for i, plan in enumerate(plans)]
         open_ones = [i for i, plan in enumerate(plans) if plan.quality == "fidelity" and i not in fewer]

@@ -1,6 +1,5 @@
 """Makes the samples of fidelity: every level at drawn viewpoints, measured against the full model."""
 
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 
@@ -30,13 +29,14 @@ from sagesplat.run.stage import run_stage
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.methods import method_of
 
-VIEWS = (100, 200, 400)  # to fit to: the next number is tried while the last step made the error smaller by
+VIEWS = (50, 100, 200)  # to fit to: the next number is tried while the last step made the error smaller by
 _SHRINKS = 0.05  # at least this share
-DEFAULT_COUNTS = {"fit": VIEWS[-1], "bias": 90, "calibration": 150}  # as many as the training's time allows;
+DEFAULT_COUNTS = {"fit": VIEWS[-1], "bias": 90, "calibration": 170}  # as many as the training's time allows;
 MOST = {"fit": VIEWS[-1], "bias": 90, "calibration": 300}  # after a long training up to these, by
 _EXTRA = 0.25  # this share of its time: they make bounds a little tighter, no more
 _RENDERS = 4.0  # a training step: sampling and fitting take 0.9 of the demo's training, 0.4 with nesting
 _SEED = 0  # of the draws
+_SOME = 100  # that tell how many pixels viewpoints have
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
 
@@ -49,14 +49,15 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     run = job.run
     if run.ladder != "nested":
         return
-    rule = Rule(_SEED, shift=config.shift, screens=config.screens, places=config.places)
+    rule = Rule(_SEED, shift=config.shift, screens=config.screens, places=config.places, fov=config.fov)
     check_limits(config, "sample.")  # before an earlier result is given up
     check_rule(rule)
 
     def make() -> list[str]:
         own, given = capture_cameras(job.scene), config.viewpoints
         base = own if given is None else read_cameras(given, own[0], job.scene.offset)
-        counts = _counts(job, config)
+        some = draw(job.scene, base, rule, {"fit": _SOME}).cameras
+        counts = _counts(job, config, _pixels(some) / _pixels(own))
         drawn = draw(job.scene, base, rule, counts, given.name if given else "capture")
         table, used = _until_it_stops_shrinking(job, drawn, fit, bool(config.views))
         rows = np.sort(np.concatenate([drawn.rows("fit")[:used], drawn.rows("bias", "calibration")]))
@@ -77,14 +78,16 @@ def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
     run_stage(job, "sample", asdict(config), inputs, [run.viewpoints, run.sampled], make)
 
 
-def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
-    """Viewpoints by set: what is asked, else what the training's time allows."""
+def _counts(job: Job, config: SampleConfig, pixels: float) -> dict[str, int]:
+    """Viewpoints by set: what is asked, else what the training's time allows.
+
+    `pixels`: of a viewpoint over those of a photo, on average.
+    """
     train, nest = settings_of(job.run, "train"), settings_of(job.run, "nest")
     base_steps = nest["base_steps"] if nest["base_share"] else 0
-    renders = _RENDERS * (train["max_steps"] + nest["steps"] + base_steps)
+    renders = _RENDERS * (train["max_steps"] + nest["steps"] + base_steps) / pixels
     compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice, for the bias three times
     levels = len(job.ladder.levels)
-    renders /= _mean_square(config.screens)
     cost = {"fit": levels + _LABEL_IMAGE, "bias": 1.5 * compositions, "calibration": compositions}
     part = renders / sum(DEFAULT_COUNTS[name] * cost[name] for name in DEFAULT_COUNTS)
     counts = {name: max(int(min(part, 1) * DEFAULT_COUNTS[name]), _FEWEST[name]) for name in DEFAULT_COUNTS}
@@ -98,10 +101,8 @@ def _counts(job: Job, config: SampleConfig) -> dict[str, int]:
     return counts
 
 
-def _mean_square(screens: tuple[float, float]) -> float:
-    """Pixels of a drawn viewpoint over those of a photo, on average: s is log-uniform."""
-    low, high = screens
-    return (high**2 - low**2) / (2 * math.log(high / low)) if high > low else low**2
+def _pixels(cameras: Sequence[Camera]) -> float:
+    return float(np.mean([camera.width * camera.height for camera in cameras]))
 
 
 def _until_it_stops_shrinking(

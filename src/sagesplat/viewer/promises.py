@@ -64,8 +64,8 @@ def ssim_document(
 ) -> dict[str, Any]:
     """The document of SSIM against photos, of at least one model. `cameras`: the V photos of `seen`."""
     some = next(iter(models.values()))
-    views = some.inputs_at(np.ones(len(cameras)), *where(cameras, some.focal))[:, :7]
-    rows = {label: _nearest(model.inputs[:, :7], views) for label, model in models.items()}
+    views = some.inputs_at(np.ones(len(cameras)), *where(cameras, some.focal)[:3])[:, :-1]
+    rows = {label: _nearest(model.inputs[:, :-1], views) for label, model in models.items()}
     used = np.unique(np.concatenate(list(rows.values())))
     used = used[_path(views[used])]
     place = np.zeros(len(views), int)
@@ -79,8 +79,8 @@ def ssim_document(
 
 
 def _head(
-    quality: QualityKind, some: ViewModel | FidelityModel, views: Float[np.ndarray, "U 7"]
-) -> tuple[dict[str, Any], Int[np.ndarray, "U 7"], Int[np.ndarray, "6 P"]]:
+    quality: QualityKind, some: ViewModel | FidelityModel, views: Float[np.ndarray, "U 8"]
+) -> tuple[dict[str, Any], Int[np.ndarray, "U 8"], Int[np.ndarray, "6 P"]]:
     """What all labels share, and the views and photos of it in whole steps."""
     shared = np.round(views * AXES / STEP).astype(int)
     photos = some.photos.T[_path(some.photos.T)]
@@ -175,7 +175,7 @@ def _cell(
     columns: Int[np.ndarray, " k"],
     place: Int[np.ndarray, " V"],
     order: Int[np.ndarray, " V"],
-    views: Float[np.ndarray, "V 7"],
+    views: Float[np.ndarray, "V 8"],
 ) -> dict[str, Any]:
     """The entry of a cell; `place`: of each view among the shared ones `views`, `order` the reverse of it."""
     by_place = np.argsort(place[cell.rows], kind="stable")
@@ -194,7 +194,7 @@ def _cell(
     }
     if not len(sent):
         return entry
-    logs = np.round(sent[:, 7] / LOG_UNIT)
+    logs = np.round(sent[:, -1] / LOG_UNIT)
     inputs = np.column_stack([views[place[cell.rows][by_place]], logs * LOG_UNIT])
     expected = matern32(known, known, model.lengths) @ weights
     found = lstsq(matern32(known, inputs, model.lengths), expected, cond=1e-9, lapack_driver="gelsy")
@@ -238,7 +238,7 @@ def _entry(
     places: Int[np.ndarray, " n"],
     rows: Int[np.ndarray, " n"],
     used: Int[np.ndarray, " U"],
-    shared: Int[np.ndarray, "U 7"],
+    shared: Int[np.ndarray, "U 8"],
     photos: Int[np.ndarray, "6 P"],
     head: dict[str, Any],
     seen: Seen | None,
@@ -279,7 +279,7 @@ def _rounded(
     entry: dict[str, Any],
     whole: dict[str, Any],
     model: ViewModel,
-    shared: Int[np.ndarray, "U 7"],
+    shared: Int[np.ndarray, "U 8"],
     photos: Int[np.ndarray, "6 P"],
     head: dict[str, Any],
 ) -> dict[str, Any]:
@@ -288,7 +288,7 @@ def _rounded(
     at = np.concatenate([own, (own + own[_neighbours(own)]) / 2])
     # a curve may jump exactly at the distance of a view: a little beyond it
     place = at[:, :3] * model.extent, at[:, 3:6], np.exp(at[:, 6])
-    viewpoints = np.exp(at[:, 7]) * (1 + 1e-9), *place
+    viewpoints = np.exp(at[:, -1]) * (1 + 1e-9), *place
     before = model.predict(*viewpoints)
     coarser = allowed_change(before.mean.mean(0)) / MAX_ROUNDING_CHANGE
     sent, change = entry, math.inf
@@ -305,13 +305,13 @@ def _rounded(
 def _with_values(
     whole: dict[str, Any],
     model: ViewModel,
-    shared: Int[np.ndarray, "U 7"],
+    shared: Int[np.ndarray, "U 8"],
     log_unit: float,
     units: Sequence[float],
 ) -> dict[str, Any]:
     """The model's entry with log distances and values, by which it predicts what the model does."""
     own, some = model.inputs, _sent_views(len(model.inputs))
-    logs = np.round(own[some, 7] / log_unit)
+    logs = np.round(own[some, -1] / log_unit)
     views = shared[np.cumsum(whole["views"])] / STEPS_PER_UNIT * AXES
     inputs = np.column_stack([views, logs * log_unit])
     expected = matern32(own, own, model.lengths) @ model.weights

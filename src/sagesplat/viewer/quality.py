@@ -69,7 +69,7 @@ def quality_entry(model: ViewModel) -> dict[str, Any]:
     null: no promise.
     """
     own = model.inputs
-    predicted = model.predict(np.exp(own[:, 7]), own[:, :3] * model.extent, own[:, 3:6], np.exp(own[:, 6]))
+    predicted = model.predict(np.exp(own[:, -1]), own[:, :3] * model.extent, own[:, 3:6], np.exp(own[:, 6]))
     return _entry(model, model.levels, predicted.mean, predicted.bound)
 
 

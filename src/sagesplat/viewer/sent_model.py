@@ -25,8 +25,8 @@ from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.quality import curve_of
 
 NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncertain by
-STEP = 1e-4  # of positions over the extent, directions, log screens, shares, targets, thresholds and slopes
-AXES = np.array([*FLIP, *FLIP, 1.0])  # signs of position, direction and log screen in the bundle's axes
+STEP = 1e-4  # of the shared inputs (positions over the extent), shares, targets, thresholds and slopes
+AXES = np.array([*FLIP, *FLIP, 1.0, 1.0])  # signs of the shared inputs in the bundle's axes
 CORRECTION_STEP = 5e-3
 FACTOR_STEP = 0.05
 STEPS_PER_UNIT = round(1 / STEP)
@@ -45,7 +45,7 @@ class SentModel:
     extent: float
     median_log_distance: float
     screens: tuple[float, float]
-    inputs: Float[np.ndarray, "n 8"]
+    inputs: Float[np.ndarray, "n 9"]
     lengths: _Lengths
     photos: Float[np.ndarray, "6 P"]
     weights: Float[np.ndarray, "n K"]
@@ -91,7 +91,7 @@ def read_model(document: dict[str, Any], label_id: int) -> SentModel:
 
 def model_of_entry(
     entry: dict[str, Any],
-    shared: Int[np.ndarray, "U 7"],
+    shared: Int[np.ndarray, "U 8"],
     photos: Int[np.ndarray, "6 P"],
     document: dict[str, Any],
 ) -> SentModel:
@@ -142,7 +142,7 @@ def read_fidelity(document: dict[str, Any]) -> dict[int, FidelityModel]:
 
 
 def _cell(
-    cell: dict[str, Any], views: Float[np.ndarray, "U 7"], lengths: Sequence[float], levels: int
+    cell: dict[str, Any], views: Float[np.ndarray, "U 8"], lengths: Sequence[float], levels: int
 ) -> CellModel:
     columns = np.minimum(np.arange(levels), len(cell["levels"]) - 1)
     inputs, factors = _inputs(cell, views), np.cumsum(cell["factors"])
@@ -151,7 +151,7 @@ def _cell(
         cell=cell["id"],
         offsets=np.array(cell["offsets"], np.float64)[columns],
         rows=np.cumsum(np.array(cell["views"], int)),
-        log_distances=inputs[:, 7],
+        log_distances=inputs[:, -1],
         median_log_distance=cell["medianLogDistance"],
         weights=weights.T[columns],
         factors=np.where(factors < 0, -1.0, factors * FACTOR_STEP),
@@ -168,19 +168,19 @@ def calibration_of(entry: dict[str, Any]) -> Calibration:
     )
 
 
-def covariance(inputs: Float[np.ndarray, "n 8"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
+def covariance(inputs: Float[np.ndarray, "n 9"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
     """The kernel between all views, with the nugget."""
     return matern32(inputs, inputs, lengths) + NUGGET * np.eye(len(inputs))
 
 
-def _inputs(cell: dict[str, Any], views: Float[np.ndarray, "U 7"]) -> Float[np.ndarray, "n 8"]:
-    """Scaled position, direction, log screen and log distance of a cell's views."""
+def _inputs(cell: dict[str, Any], views: Float[np.ndarray, "U 8"]) -> Float[np.ndarray, "n 9"]:
+    """The inputs of a cell's views."""
     logs = np.cumsum(cell["logDistances"]["steps"]) * cell["logDistances"]["unit"]
     return np.column_stack([views[np.cumsum(np.array(cell["views"], int))], logs])
 
 
 def _weights(
-    cell: dict[str, Any], inputs: Float[np.ndarray, "n 8"], lengths: Sequence[float]
+    cell: dict[str, Any], inputs: Float[np.ndarray, "n 9"], lengths: Sequence[float]
 ) -> Float[np.ndarray, "n K"]:
     values = np.cumsum(np.cumsum(cell["values"]["steps"], 0), 1).T * cell["values"]["units"]
     return cho_solve(cho_factor(covariance(inputs, lengths)), values)

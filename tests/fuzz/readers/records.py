@@ -117,7 +117,7 @@ def _fidelity(folder: Path, size: int) -> list[bytes]:
         "cell": 1, "offsets": [0.5, 1.0], "rows": [0, 1], "log_distances": [0.1, 0.2],
         "median_log_distance": 0.1, "weights": [[0.1, 0.2], [0.0, 0.0]], "factors": [0.5, -1.0],
     }  # fmt: skip
-    entry = {name: promise[name] for name in names} | {"views": [[0.1] * 7, [0.2] * 7], "cells": [cell]}
+    entry = {name: promise[name] for name in names} | {"views": [[0.1] * 8, [0.2] * 8], "cells": [cell]}
     return as_json({"models": [entry | {"label_id": 2 + i} for i in range(size)]})
 
 
@@ -134,7 +134,7 @@ def _promises(folder: Path, size: int) -> list[bytes]:
         "lengths": [1, 2, 0.5, 0.7],
         "screens": [0.5, 2],
     }
-    entry |= {"inputs": [[0.1] * 8, [0.2] * 8], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
+    entry |= {"inputs": [[0.1] * 9, [0.2] * 9], "heldout_inputs": [False, True], "weights": [[0.1], [0.2]]}
     entry["photos"] = [[0.1, 0.3]] * 6
     calibration = {"status": sorted(viewpoint.STATUSES)[0], "confidence": 0.95, "num_views": 20}
     calibration |= {"targets": [0.5, 0.7], "thresholds": [0.52, 0.7], "least_support": 0.2}  # type: ignore

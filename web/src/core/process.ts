@@ -2,6 +2,8 @@
 
 /** Added to the kernel's diagonal; the same as in src/sagesplat/viewer/promises.py. */
 const NUGGET = 1e-3;
+/** Position, direction, log screen, log field, log distance. */
+const INPUTS = 9;
 
 /** Matern 3/2 of the square of a scaled difference. */
 export function matern(square: number): number {
@@ -9,14 +11,14 @@ export function matern(square: number): number {
   return (1 + scaled) * Math.exp(-scaled);
 }
 
-/** The lower half of C + NUGGET I for n views, whose inputs [n, 8] are divided by the length scales. */
+/** The lower half of C + NUGGET I for n views, whose inputs [n, INPUTS] are divided by the length scales. */
 export function covariance(scaled: Float64Array, n: number): Float64Array {
   const S = new Float64Array(n * n);
   for (let i = 0; i < n; i++) {
     for (let j = 0; j <= i; j++) {
       let square = 0;
-      for (let k = 0; k < 8; k++) {
-        const apart = (scaled[8 * i + k] as number) - (scaled[8 * j + k] as number);
+      for (let k = 0; k < INPUTS; k++) {
+        const apart = (scaled[INPUTS * i + k] as number) - (scaled[INPUTS * j + k] as number);
         square += apart * apart;
       }
       S[i * n + j] = matern(square) + (i === j ? NUGGET : 0);

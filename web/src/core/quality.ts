@@ -28,10 +28,10 @@ export interface Keeps {
   readonly needed: ArrayLike<number>;
 }
 
-/** Where and on what screen: all that models know of a viewpoint. */
-type From = Pick<Viewpoint, "position" | "direction" | "focal">;
+/** Where, on what screen and through what lens: all that models know of a viewpoint. */
+type From = Pick<Viewpoint, "position" | "direction" | "focal" | "lens">;
 
-/** Steps of positions over the extent, directions, log screens, targets, thresholds and slopes. */
+/** Steps of positions over the extent, directions, log screens and fields, targets, thresholds and slopes. */
 const STEP = 1e-4;
 const CORRECTION_STEP = 5e-3;
 const FACTOR_STEP = 0.05;
@@ -86,21 +86,21 @@ export function outlookAnywhere(known: LabelQuality | undefined): Outlook {
 const NEIGHBOUR_EXPONENT = 16;
 const HALF_WEIGHT = 1e-3;
 
-const COLUMNS = 7; // of the shared views: position over the extent, direction, log screen
-const PHOTO_COLUMNS = 6; // of the photos: without the screen
+const COLUMNS = 8; // of the shared views: position over the extent, direction, log screen, log field
+const PHOTO_COLUMNS = 6; // of the photos: position and direction
 const PLACE_LENGTHS = [0.3, 0.5] as const; // of position and direction, for photos and factors
 
 /** The views that the models of all labels share, and how far they are from the current viewpoint. */
 export class Views {
   readonly away: Float64Array; // [V] square of the distance over the extent
   readonly turned: Float64Array; // [V] square of the difference of the directions
-  readonly rescaled: Float64Array; // [V] square of the difference of the log screens
+  readonly rescaled: Float64Array; // [V] square of the difference of the log screens and log fields
   readonly alike: Float64Array; // [V] of place: 1 at the view
   readonly rows: Float64Array; // [V, COLUMNS]
   private readonly photos: Float64Array; // [P, PHOTO_COLUMNS]
   fromPhotos = Number.NaN; // of the current viewpoint: 0 at a photo, 1 far from all; NaN: none are known
 
-  constructor(private readonly sent: Pick<Promises, "views" | "photos" | "extent" | "focal" | "screens">) {
+  constructor(private readonly sent: Pick<Promises, "quality" | "views" | "photos" | "extent" | "focal" | "screens">) {
     this.rows = byRow(sent.views);
     this.photos = byRow(sent.photos);
     const count = this.rows.length / COLUMNS;
@@ -117,13 +117,15 @@ export class Views {
     const [a, b, c] = viewpoint.direction;
     const [smallest, largest] = sent.screens;
     const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), smallest), largest));
+    // SSIM is known in the photos' pictures alone
+    const field = sent.quality === "ssim" ? 0 : Math.log(fieldOf(viewpoint));
     const [position, direction] = PLACE_LENGTHS;
     for (let i = 0, at = 0; i < this.away.length; i++, at += COLUMNS) {
       const away = square(x, y, z, rows, at);
       const turned = square(a, b, c, rows, at + 3);
       this.away[i] = away;
       this.turned[i] = turned;
-      this.rescaled[i] = (screen - (rows[at + 6] as number)) ** 2;
+      this.rescaled[i] = (screen - (rows[at + 6] as number)) ** 2 + (field - (rows[at + 7] as number)) ** 2;
       this.alike[i] = matern(away / position ** 2 + turned / direction ** 2);
     }
     let least = Infinity;
@@ -150,6 +152,9 @@ function byRow(columns: readonly (readonly number[])[]): Float64Array {
 export const screenOf = ({ focal }: Pick<Viewpoint, "focal">, photos: Pick<Promises, "focal">): number =>
   (focal ?? photos.focal) / photos.focal;
 
+/** A viewpoint's field: root of the picture's area, at distance 1. */
+const fieldOf = ({ lens: [x, y] }: Pick<Viewpoint, "lens">): number => 2 * Math.sqrt(x * y);
+
 function square(x: number, y: number, z: number, rows: Float64Array, at: number): number {
   const dx = x - (rows[at] as number);
   const dy = y - (rows[at + 1] as number);
@@ -157,7 +162,7 @@ function square(x: number, y: number, z: number, rows: Float64Array, at: number)
   return dx * dx + dy * dy + dz * dz;
 }
 
-/** Factors of squares that divide inputs by their length scales: position, direction, log screen, log distance. */
+/** Factors of squares that divide inputs by their length scales: position, direction, screen and field, distance. */
 const scalesOf = ({ lengths }: LabelPromises) =>
   lengths.map((length) => length ** -2) as [number, number, number, number];
 
@@ -260,7 +265,7 @@ export class CellModel {
     const { own, scale, logDistances, sent } = this;
     const { rows } = this.views;
     const [a, b, c, d] = scale.map(Math.sqrt) as [number, number, number, number];
-    const by = [a, a, a, b, b, b, c];
+    const by = [a, a, a, b, b, b, c, c];
     const scaled = new Float64Array((COLUMNS + 1) * own.length);
     for (let i = 0, at = 0; i < own.length; i++) {
       const row = COLUMNS * (own[i] as number);

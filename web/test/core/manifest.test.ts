@@ -209,7 +209,7 @@ test("many things wrong are named up to a few", () => {
 test.each([
   ["quality", "ssim", 'quality must be "fidelity"'],
   ["extent", "far", "extent must be a number"],
-  ["views", [[1]], "views must be a list of 7"],
+  ["views", [[1]], "views must be a list of 8"],
   ["focal", 0, "focal must be a number above 0"],
   ["screens", [1], "screens must be a list of 2"],
   ["screens", [2, 0.5], "screens must be from the smaller to the larger"],
