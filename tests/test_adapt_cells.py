@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from sagesplat.adapt.cells import POINTS, STEPS, Cells, describe_cells, look, read_cells, write_cells
+from sagesplat.adapt.cells import (
+    POINTS,
+    STEPS,
+    Cells,
+    describe_cells,
+    look,
+    reaching,
+    read_cells,
+    write_cells,
+)
 from sagesplat.core.errors import DataError
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.scene.scene import Camera
@@ -95,6 +104,21 @@ def test_a_point_on_the_edge_counts_by_half():
     )  # fmt: skip
     sight = look(cells, [camera(K=((32, 0, 32), (0, 24, 24), (0, 0, 1)), angle=0, position=(0, 0, 0))])
     assert sight.apparent[0, 0] == pytest.approx(2 * 0.5 / 32 * 32 * 24 / (64 * 48))
+
+
+def test_cells_are_in_sight_from_where_they_were_seen():
+    points = [[3.0, 0, 2], [9.0, 0, 2], [0.0, 0, 4]]  # outside of the picture, far outside, within
+    cells = describe_cells(gaussians(points, [0, 1, 2]), dict.fromkeys(range(3), 7))
+    view = camera(K=((32, 0, 32), (0, 24, 24), (0, 0, 1)), angle=0, position=(0, 0, 0))
+    assert (look(cells, [view]).apparent[0] > 0).tolist() == [False, False, True]
+    same = reaching(cells, [view], np.array([[9e-4, 0.0, 0.5]]))  # too little to count
+    assert same.radius.tolist() == cells.radius.tolist()
+    wider = reaching(cells, [view, view], np.array([[0.01, 0.0, 0.5], [0.0, 0.0, 0.5]]))
+    assert wider.radius[0] == pytest.approx(1 / np.sqrt(2) / 0.9)  # its distance from the plane x = z
+    assert wider.radius[1:].tolist() == cells.radius[1:].tolist()
+    before, after = (look(some, [view]).apparent[0] for some in (cells, wider))
+    assert 0 < after[0] < before[2]
+    assert after[1:].tolist() == before[1:].tolist()
 
 
 def test_equal_places_are_one_point_and_invisible_gaussians_have_no_area():

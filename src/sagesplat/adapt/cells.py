@@ -4,7 +4,8 @@ A cell is described by at most 16 points, each of which stands for an area: of t
 of the two longer axes' product times the opacity. From a viewpoint, with h_i the least signed height of a
 point over the planes of the frustum:
 
-    in_i     = clamp(1/2 + h_i / (2 radius), 0, 1)       radius: within it are 90 % of the Gaussians
+    in_i     = clamp(1/2 + h_i / (2 radius), 0, 1)       radius: within it are 90 % of the Gaussians;
+                                                         larger where known views show the cell from farther
     apparent = f_x f_y / (width height) * sum_i area_i in_i / distance_i^2
     distance = the weighted 25th percentile of distance_i, by area_i in_i
 
@@ -13,7 +14,7 @@ point over the planes of the frustum:
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,8 @@ STEPS = 255  # of positions within the bounds, and of areas
 PERCENTILE = 0.25  # of a cell's distances
 LABEL_PERCENTILE = 0.05  # of those of a category as a whole
 _AROUND = 0.9  # share of a cell's Gaussians within its radius around the points
+_IN_SIGHT = 1e-3  # of the picture's pixels: a cell that covers them is in sight, with
+_AT_LEAST = 0.05  # of the area of its closest point at least
 _SAMPLE = 2000  # Gaussians of a cell that its points are found from
 
 
@@ -122,6 +125,19 @@ def look(cells: Cells, cameras: Sequence[Camera]) -> Sight:
     return Sight(apparent, distance)
 
 
+def reaching(cells: Cells, cameras: Sequence[Camera], shares: Float[np.ndarray, "V C"]) -> Cells:
+    """The cells with larger radii where their Gaussians reach farther from the points than most of them are.
+
+    `shares`: of the picture's pixels that each covers from V cameras. From where it covers a thousandth it is
+    in sight: a cell that seems out of sight is drawn at its lowest level, which would spill over others.
+    """
+    radius, solid = cells.radius.copy(), cells.grid[..., 3] > 0
+    for (_, height), share in zip(_heights(cells, cameras), shares, strict=True):
+        outside = -np.where(solid, height, -np.inf).max(1)
+        radius = np.maximum(radius, np.where(share >= _IN_SIGHT, outside / (1 - 2 * _AT_LEAST), 0))
+    return replace(cells, radius=radius)
+
+
 def label_distances(cells: Cells, cameras: Sequence[Camera]) -> Float[np.ndarray, "V L"]:
     """Distance of each label as a whole: a low percentile over the points of its cells; NaN: out of sight."""
     labels = np.unique(cells.labels)
@@ -137,7 +153,14 @@ def label_distances(cells: Cells, cameras: Sequence[Camera]) -> Float[np.ndarray
 
 def _seen(cells: Cells, cameras: Sequence[Camera]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """For each camera the points' distances and their areas in sight, both [C, P]."""
-    points, areas = cells.points(), cells.areas()
+    areas, radius = cells.areas(), np.maximum(cells.radius, 1e-9)[:, None]
+    for away, height in _heights(cells, cameras):
+        yield away, areas * np.clip(0.5 + height / (2 * radius), 0, 1)
+
+
+def _heights(cells: Cells, cameras: Sequence[Camera]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For each camera the points' distances and least heights over the planes of its frustum, [C, P]."""
+    points = cells.points()
     for camera in cameras:
         R, t = camera.w2c[:3, :3].astype(np.float64), camera.w2c[:3, 3].astype(np.float64)
         x, y, z = np.moveaxis(points @ R.T + t, -1, 0)
@@ -148,8 +171,7 @@ def _seen(cells: Cells, cameras: Sequence[Camera]) -> Iterator[tuple[np.ndarray,
             high = (size[axis] - K[axis, 2]) / K[axis, axis]
             height = np.minimum(height, (along - low * z) / np.hypot(1, low))
             height = np.minimum(height, (high * z - along) / np.hypot(1, high))
-        inside = np.clip(0.5 + height / (2 * np.maximum(cells.radius, 1e-9)[:, None]), 0, 1)
-        yield np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-9), areas * inside
+        yield np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-9), height
 
 
 def _percentile(

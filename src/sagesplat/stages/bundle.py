@@ -30,6 +30,7 @@ from sagesplat.stages.export import increment_files
 from sagesplat.stages.looks import looks
 from sagesplat.stages.plan import main_target
 from sagesplat.stages.results import (
+    cells_of,
     fidelity_of,
     has_photos,
     increments_of,
@@ -105,7 +106,7 @@ def bundle(
     full = full_scene(listed)
     g, drawn = read_increments(job.run.increments, full), viewpoints_of(job)
     contents = replace(
-        bundle_contents(job, g, job.cells, job.antialiased),
+        bundle_contents(job, g, cells_of(job), job.antialiased),
         chunks=listed,
         meters_per_unit=meters_per_unit,
         drawn=[drawn.cameras[row] for row in drawn.rows("fit")],

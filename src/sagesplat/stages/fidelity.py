@@ -1,11 +1,13 @@
 """Makes the fidelity models of nested levels, from drawn viewpoints; compositions calibrate them."""
 
 from collections.abc import Collection, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs
 from sagesplat.adapt.cell_models import FidelityModel, expect
+from sagesplat.adapt.cells import Cells
 from sagesplat.adapt.fidelity import measure_compositions, pooled_cells, shown_enough
 from sagesplat.adapt.fidelity_models import (
     NOMINAL,
@@ -27,7 +29,7 @@ from sagesplat.run.job import Job
 from sagesplat.run.remote import work_all
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
-from sagesplat.stages.results import increments_of, sampled_of, viewpoints_of
+from sagesplat.stages.results import cells_of, increments_of, sampled_of, viewpoints_of
 
 _ROUNDS = 2  # after one, categories whose neighbours moved much would seem to be beyond help; one has none
 
@@ -42,7 +44,7 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, FidelityModel]:
     )
     models = fit_fidelity(
         sampled,
-        job.cells,
+        cells_of(job),
         fit,
         job.scene.scale,
         confidence,
@@ -65,7 +67,7 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, FidelityModel]:
 def trial(models: Mapping[int, FidelityModel], compositions: "Compositions") -> Trial:
     """Compositions planned with the models at viewpoints, measured."""
     job, cameras = compositions.job, compositions.cameras
-    expected = expect(models, job.cells, cameras, len(job.ladder.levels))
+    expected = expect(models, compositions.cells, cameras, len(job.ladder.levels))
     planned = plan_nominal(models, expected, cell_costs(job).transfer_bytes, NOMINAL)
     fidelity, pixels = compositions.measure(planned)
     shown = shown_enough(pixels, cameras)
@@ -89,6 +91,11 @@ class Compositions:
         self.job, self.cameras, self._only = job, cameras, only
         self._known: list[dict[tuple[int, ...], np.ndarray]] = [{} for _ in cameras]
         self._pixels = np.zeros((len(cameras), 0), np.int32)
+
+    @cached_property
+    def cells(self) -> Cells:
+        """The cells, as `cells_of`."""
+        return cells_of(self.job)
 
     def measure(self, planned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `compositions_at`."""

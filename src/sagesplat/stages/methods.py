@@ -20,6 +20,7 @@ from sagesplat.adapt.bound_plans import (
 )
 from sagesplat.adapt.calibrate import fewest_views
 from sagesplat.adapt.cell_models import Expected, FidelityModel, expect, promised, write_fidelity
+from sagesplat.adapt.cells import Cells
 from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
@@ -42,6 +43,7 @@ from sagesplat.segment.masks import UNLABELLED
 from sagesplat.stages.fidelity import cell_costs, compositions_at, fit_drawn
 from sagesplat.stages.method import Curves, Method
 from sagesplat.stages.results import (
+    cells_of,
     fidelity_of,
     has_photos,
     promises_of,
@@ -117,7 +119,11 @@ class NestedLevels(Method):
 
     def expect(self, cameras: Sequence[Camera]) -> Expected:
         """What cameras are expected to see of the cells."""
-        return expect(self.fidelity, self.job.cells, cameras, len(self.job.ladder.levels))
+        return expect(self.fidelity, self._cells, cameras, len(self.job.ladder.levels))
+
+    @cached_property
+    def _cells(self) -> Cells:
+        return cells_of(self.job)
 
     @cached_property
     def shown(self) -> np.ndarray:

@@ -19,6 +19,7 @@ from sagesplat.stages.fidelity import Compositions, trial
 from sagesplat.stages.fit import fit_curves
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.results import (
+    cells_of,
     fidelity_of,
     has_photos,
     models_of,
@@ -69,8 +70,9 @@ def _fit_drawn(
     """Models of fidelity: as `stages.fidelity.fit_drawn`, with neighbours whose models are known."""
     drawn, sampled, confidence = viewpoints_of(job), sampled_of(job), config.confidence
     fit = [drawn.cameras[row] for row in drawn.rows("fit")]
-    rows = np.flatnonzero(np.isin(job.cells.labels, sorted(set(changed) - {UNLABELLED})))
-    cells, names = job.cells.select(rows), ("fidelity", "pixels", "distance")
+    all_cells = cells_of(job)
+    rows = np.flatnonzero(np.isin(all_cells.labels, sorted(set(changed) - {UNLABELLED})))
+    cells, names = all_cells.select(rows), ("fidelity", "pixels", "distance")
     mine = replace(
         sampled, labels=tuple(cells.ids.tolist()), **{name: getattr(sampled, name)[:, rows] for name in names}
     )

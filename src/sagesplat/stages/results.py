@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from sagesplat.adapt.cell_models import FidelityModel, read_fidelity
+from sagesplat.adapt.cells import Cells, reaching
 from sagesplat.adapt.eq3 import SsimModel, read_models
 from sagesplat.adapt.evaluate import UNIFORM, Evaluation, read_evaluation
 from sagesplat.adapt.fidelity import SampledFidelity, read_sampled
@@ -122,6 +123,13 @@ def sampled_of(job: Job) -> SampledFidelity:
     if len(viewpoints_of(job).rows("fit")) != V:
         raise _foreign(path, "sample", f"{V} viewpoints")
     return sampled
+
+
+def cells_of(job: Job) -> Cells:
+    """The cells, in sight from wherever the sampled viewpoints show them."""
+    drawn, sampled = viewpoints_of(job), sampled_of(job)
+    fit = [drawn.cameras[row] for row in drawn.rows("fit")]
+    return reaching(job.cells, fit, sampled.pixels / sampled.image[:, None])
 
 
 def increments_of(job: Job) -> list[Increment]:
