@@ -277,7 +277,16 @@ export function modelOf(
 const LOG_FIELD = 0.5 * Math.log(4 * 0.8 * 0.5); // of `at`'s lens
 
 function promisesOf(labels: readonly Label[], random: () => number): Promises {
-  const views = Array.from({ length: 12 }, () => [10 * random() - 5, 0, 4 * random(), 0, 0, -1, 0, LOG_FIELD]);
+  const views = Array.from({ length: 12 }, () => [
+    10 * random() - 5,
+    0,
+    4 * random(),
+    0,
+    0,
+    -1,
+    0,
+    LOG_FIELD,
+  ]);
   const rows = views.map((_, i) => i);
   const column = (axis: number) =>
     differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1)));

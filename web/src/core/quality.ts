@@ -100,7 +100,9 @@ export class Views {
   private readonly photos: Float64Array; // [P, PHOTO_COLUMNS]
   fromPhotos = Number.NaN; // of the current viewpoint: 0 at a photo, 1 far from all; NaN: none are known
 
-  constructor(private readonly sent: Pick<Promises, "quality" | "views" | "photos" | "extent" | "focal" | "screens">) {
+  constructor(
+    private readonly sent: Pick<Promises, "quality" | "views" | "photos" | "extent" | "focal" | "screens">,
+  ) {
     this.rows = byRow(sent.views);
     this.photos = byRow(sent.photos);
     const count = this.rows.length / COLUMNS;

@@ -120,7 +120,7 @@ test.each(promiseCases.filter((one): one is SsimCase => !isOfCells(one)))(
     const { whole } = model as { whole: CellModel };
     for (const { position, direction, focal, ...expected } of viewpoints) {
       const distance = expected.distance ?? Number.NaN;
-      views.from({ position, direction, ...(focal !== null && { focal }) });
+      views.from({ ...at(0), position, direction, ...(focal !== null && { focal }) });
       near(whole.corrected(distance), expected.corrected, "corrected", EXACT);
       const { support, keeps } = model.outlook(distance);
       near(support, expected.support, "support", EXACT);
