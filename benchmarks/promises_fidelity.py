@@ -1,7 +1,7 @@
 """Coverage of fidelity bounds at fresh viewpoints, and plans beside equal levels of the same bytes."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -95,7 +95,9 @@ def measure(
     }  # fmt: skip
 
 
-def by_condition(job: Job, views: int = 200, seed: int = 91_000) -> dict[str, Any]:
+def by_condition(
+    job: Job, views: int = 200, seed: int = 91_000, conditions: Mapping[str, Condition] = CONDITIONS
+) -> dict[str, Any]:
     """The targets by condition: kept, excess, share that has a promise, MB of plans and of a perfect planner.
 
     The perfect planner knows the fidelity of every cell at every level, all at one, and takes the levels of
@@ -103,7 +105,7 @@ def by_condition(job: Job, views: int = 200, seed: int = 91_000) -> dict[str, An
     """
     method, rule, names = NestedLevels(job), viewpoints_of(job).rule, job.names()
     labels, costs, targets, found = list(method.costs.labels), method.cell_costs, np.array(TARGETS), {}
-    for name, (places, screen, lens) in CONDITIONS.items():
+    for name, (places, screen, lens) in conditions.items():
         fov = 1.0 if lens else rule.fov  # without a lens, as sharp as asked
         drawn = replace(rule, seed=rule.seed + seed, places=places, screens=(screen, screen), fov=fov)
         cameras = draw(job.scene, capture_cameras(job.scene), drawn, {"test": views}).cameras

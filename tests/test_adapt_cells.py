@@ -1,5 +1,7 @@
 """Descriptions of cells and how viewpoints see them, against the formulas computed in another way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -116,6 +118,8 @@ def test_cells_are_in_sight_from_where_they_were_seen():
     wider = reaching(cells, [view, view], np.array([[0.01, 0.0, 0.5], [0.0, 0.0, 0.5]]))
     assert wider.radius[0] == pytest.approx(1 / np.sqrt(2) / 0.9)  # its distance from the plane x = z
     assert wider.radius[1:].tolist() == cells.radius[1:].tolist()
+    nothing = reaching(replace(cells, grid=cells.grid * 0), [view], np.full((1, 3), 0.5))
+    assert nothing.radius.tolist() == cells.radius.tolist()  # no areas: in sight from nowhere
     before, after = (look(some, [view]).apparent[0] for some in (cells, wider))
     assert 0 < after[0] < before[2]
     assert after[1:].tolist() == before[1:].tolist()

@@ -22,7 +22,7 @@ from make_viewer_vectors import SCREENS, calibration, model
 from page_checks import wrong_with, wrong_with_keyboard
 from PIL import Image
 
-from sagesplat.adapt.cell_models import CellModel, FidelityModel
+from sagesplat.adapt.cell_models import CellModel, FidelityModel, views_of
 from sagesplat.adapt.cells import describe_cells
 from sagesplat.adapt.process import inputs_of
 from sagesplat.adapt.viewpoint import Calibration, QualityKind, ViewModel, where
@@ -159,9 +159,9 @@ def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("promised")
     contents = three_walls(folder)
     cameras = [entry.camera for entry in contents.cameras]
-    position, direction, screen, field = where(cameras, camera().focal)
+    position, direction, screen = where(cameras, camera().focal)
     views = inputs_of(np.full(len(cameras), 5.0), position, direction, 1.0, 0.0, screen)
-    through = inputs_of(np.full(len(cameras), 5.0), position, direction, 1.0, 0.0, screen, field)
+    known = views_of(cameras, 1.0, camera().focal, SCREENS)
     seen = Seen(np.full(len(cameras), 0.3), np.full(len(cameras), 5.0))
 
     def usual(label: int, quality: QualityKind) -> Calibration:
@@ -183,7 +183,7 @@ def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
             np.zeros((4, 0)), np.full(len(views), -1.0),
         )  # fmt: skip
         return FidelityModel(
-            label, 1.0, camera().focal, SCREENS, through[:, :-1], LENGTHS, views[:, :6].T, (cell,), 0.0,
+            label, 1.0, camera().focal, SCREENS, known, LENGTHS, views[:, :6].T, (cell,), 0.0,
             usual(label, "fidelity"),
         )  # fmt: skip
 

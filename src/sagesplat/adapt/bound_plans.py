@@ -78,7 +78,7 @@ def quality_at(
     for i, label in enumerate(costs.labels):
         far[:, i] = distances.get(label, far[:, i])
         if label in promises:
-            predicted = promises[label].predict(far[:, i], *at[:3])
+            predicted = promises[label].predict(far[:, i], *at)
             known = np.array(promises[label].levels) - 1
             mean[:, i, known], bound[:, i, known] = predicted.mean, predicted.bound
             calibrated[i] = promises[label].status == "calibrated"

@@ -147,7 +147,7 @@ def expect(
     support, away = np.full((len(cameras), len(labels)), np.nan), np.zeros(len(cameras))
     place = {cell: i for i, cell in enumerate(cells.ids.tolist())}
     for label, model in models.items():
-        known = inputs_at(model, cameras)
+        known = views_of(cameras, model.extent, model.focal, model.screens)
         away = 1 - matern32(known[:, :6], model.photos.T, PHOTO_LENGTHS).max(1)
         support[:, np.searchsorted(labels, label)] = matern32(known, model.views, model.lengths[:3]).max(1)
         near = matern32(known[:, :6], model.views[:, :6], PHOTO_LENGTHS)
@@ -162,16 +162,12 @@ def expect(
     return Expected(cells.ids, labels, column, mean, share, sight.distance, support, away)
 
 
-def inputs_at(model: FidelityModel, cameras: Sequence[Camera]) -> Float[np.ndarray, "V 8"]:
-    """The inputs of viewpoints without distances."""
-    return views_of(cameras, model.extent, model.focal, model.screens)
-
-
 def views_of(
     cameras: Sequence[Camera], extent: float, focal: float, screens: tuple[float, float]
 ) -> Float[np.ndarray, "V 8"]:
-    """`FidelityModel.views` of cameras."""
-    position, direction, screen, field = where(cameras, focal)
+    """The inputs of viewpoints without distances, as `FidelityModel.views`."""
+    position, direction, screen = where(cameras, focal)
+    field = np.sqrt([camera.width * camera.height / camera.focal**2 for camera in cameras])
     screen = np.clip(screen, *screens)
     return inputs_of(np.ones(len(cameras)), position, direction, extent, 0.0, screen, field)[:, :-1]
 

@@ -134,7 +134,8 @@ def reaching(cells: Cells, cameras: Sequence[Camera], shares: Float[np.ndarray, 
     radius, solid = cells.radius.copy(), cells.grid[..., 3] > 0
     for (_, height), share in zip(_heights(cells, cameras), shares, strict=True):
         outside = -np.where(solid, height, -np.inf).max(1)
-        radius = np.maximum(radius, np.where(share >= _IN_SIGHT, outside / (1 - 2 * _AT_LEAST), 0))
+        seen = (share >= _IN_SIGHT) & solid.any(1)  # without an area it is in sight from nowhere
+        radius = np.maximum(radius, np.where(seen, outside / (1 - 2 * _AT_LEAST), 0))
     return replace(cells, radius=radius)
 
 

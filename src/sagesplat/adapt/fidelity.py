@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int16, Int32
+from jaxtyping import Bool, Float, Float32, Int, Int16, Int32
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
 from sagesplat.adapt.observe import RenderedLabels, render_rgb
@@ -64,6 +64,10 @@ class SampledFidelity:
     def shown(self) -> np.ndarray:
         """Whether a category covers at least `PROMISED_SHARE` of the image, bool [V, L]."""
         return (self.pixels > 0) & (self.pixels >= PROMISED_SHARE * self.image[:, None])
+
+    def shares(self) -> Float[np.ndarray, "V L"]:
+        """Of the picture's pixels."""
+        return self.pixels / self.image[:, None]
 
 
 def pooled_cells(

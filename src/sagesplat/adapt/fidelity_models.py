@@ -136,7 +136,7 @@ def _fit(
     screens: tuple[float, float],
 ) -> FidelityModel:
     sampled, sight = part.sampled, part.sight
-    shares = sampled.pixels / sampled.image[:, None]
+    shares = sampled.shares()
     factors, average = factors_of(sight, shares), category.mean(0)
     # a last level that is the full model is known, and no part of the process (unless it is the only one)
     known = bool((category[:, -1] == 1).all())
@@ -197,7 +197,7 @@ def _fit(
 
 def photo_places(photos: Sequence[Camera], extent: float) -> Float[np.ndarray, "6 P"]:
     """`ViewModel.photos` of cameras, at most `MOST_PHOTOS`."""
-    position, direction, *_ = where(photos, 1.0)
+    position, direction, _ = where(photos, 1.0)
     places = np.column_stack([position / extent, direction])
     return places[_farthest(places, MOST_PHOTOS, PHOTO_LENGTHS)].T
 

@@ -199,21 +199,18 @@ class ViewModel:
 
 
 class Where(NamedTuple):
-    """What models know of V cameras; all but the field as `ViewModel.predict` takes it after the distance."""
+    """Where V cameras are, as `ViewModel.predict` takes it after the distance."""
 
     position: Float[np.ndarray, "V 3"]  # world
     direction: Float[np.ndarray, "V 3"]
     screen: Float[np.ndarray, " V"]
-    field: Float[np.ndarray, " V"]  # root of the picture's area, at distance 1
 
 
 def where(cameras: Sequence[Camera], focal: float) -> Where:
     """Of cameras, by the photos' focal length in pixels."""
     position = np.array([camera.position for camera in cameras], np.float64).reshape(-1, 3)
     direction = np.array([camera.direction for camera in cameras], np.float64).reshape(-1, 3)
-    own = np.array([camera.focal for camera in cameras], np.float64)
-    pixels = np.array([camera.width * camera.height for camera in cameras], np.float64)
-    return Where(position, direction, own / focal, np.sqrt(pixels) / own)
+    return Where(position, direction, np.array([camera.focal for camera in cameras], np.float64) / focal)
 
 
 def away_from(

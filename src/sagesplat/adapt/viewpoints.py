@@ -139,13 +139,14 @@ def check_rule(rule: Rule) -> None:
 
 
 def in_words(drawn: Viewpoints) -> str:
-    """What screens and places viewpoints were drawn for."""
+    """What screens, lenses and places viewpoints were drawn for."""
     low, high = drawn.rule.screens
     shares = np.array(drawn.rule.places) / sum(drawn.rule.places)
     places = ("on the capture's path", "walking among its cameras", "stepping back from them")
     where = [f"{share:.0%} {place}" for share, place in zip(shares, places, strict=True) if share > 0]
     screens = f"screens of {low:g} to {high:g} times the photos' focal length of {drawn.focal:.0f} pixels"
-    return f"{screens}; lenses up to {drawn.rule.fov:g} degrees; viewpoints: {', '.join(where)}"
+    lenses = f"lenses: the photos' and up to {drawn.rule.fov:g} degrees"
+    return f"{screens}; {lenses}; viewpoints: {', '.join(where)}"
 
 
 def capture_cameras(scene: Scene) -> list[Camera]:

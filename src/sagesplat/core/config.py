@@ -250,10 +250,11 @@ class SampleConfig:
     """Viewpoints at which the levels are measured against the full model."""
 
     views: Viewpoints = 0
-    """Viewpoints that the fidelity models are fitted to; 0: until their error stops shrinking, within about
-    0.6 of the training's time."""
+    """Viewpoints that the fidelity models are fitted to; 0: until their error stops shrinking, 200 at most,
+    fewer after a short training."""
     calibration_views: Viewpoints = 0
-    """Viewpoints that calibrate the bounds; 0: 200, or fewer after a short training."""
+    """Viewpoints that calibrate the bounds; 0: 170, fewer after a short training and up to 300 after a long
+    one."""
     viewpoints: Path | None = None
     """File with the cameras to draw from: a viewpoints.json, or a transforms.json (default: the cameras of
     the training and calibration photos)."""

@@ -1,7 +1,6 @@
 """Makes the fidelity models of nested levels, from drawn viewpoints; compositions calibrate them."""
 
 from collections.abc import Collection, Mapping, Sequence
-from functools import cached_property
 
 import numpy as np
 
@@ -37,6 +36,7 @@ _ROUNDS = 2  # after one, categories whose neighbours moved much would seem to b
 def fit_drawn(job: Job, config: FitConfig) -> dict[int, FidelityModel]:
     """Models of fidelity by label id, calibrated at viewpoints that nothing was fitted to."""
     drawn, sampled, confidence = viewpoints_of(job), sampled_of(job), config.confidence
+    cells = cells_of(job)
     fit = [drawn.cameras[row] for row in drawn.rows("fit")]
     bias, calibration = (
         Compositions(job, [drawn.cameras[row] for row in drawn.rows(name)])
@@ -44,7 +44,7 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, FidelityModel]:
     )
     models = fit_fidelity(
         sampled,
-        cells_of(job),
+        cells,
         fit,
         job.scene.scale,
         confidence,
@@ -56,18 +56,18 @@ def fit_drawn(job: Job, config: FitConfig) -> dict[int, FidelityModel]:
     held = NOTHING_HELD
     alone = len(np.unique(job.cells.labels)) == 1
     for _ in range(1 if alone else _ROUNDS):
-        models = remove_composition_bias(models, trial(models, bias), confidence)
+        models = remove_composition_bias(models, trial(models, cells, bias), confidence)
     if not alone:
-        models, held = hold_all_categories(models, trial(models, bias), confidence)
+        models, held = hold_all_categories(models, trial(models, cells, bias), confidence)
     for _ in range(_ROUNDS):  # what calibration moved moves the neighbours
-        models = calibrated(models, trial(models, calibration), confidence, held)
+        models = calibrated(models, trial(models, cells, calibration), confidence, held)
     return models
 
 
-def trial(models: Mapping[int, FidelityModel], compositions: "Compositions") -> Trial:
+def trial(models: Mapping[int, FidelityModel], cells: Cells, compositions: "Compositions") -> Trial:
     """Compositions planned with the models at viewpoints, measured."""
     job, cameras = compositions.job, compositions.cameras
-    expected = expect(models, compositions.cells, cameras, len(job.ladder.levels))
+    expected = expect(models, cells, cameras, len(job.ladder.levels))
     planned = plan_nominal(models, expected, cell_costs(job).transfer_bytes, NOMINAL)
     fidelity, pixels = compositions.measure(planned)
     shown = shown_enough(pixels, cameras)
@@ -91,11 +91,6 @@ class Compositions:
         self.job, self.cameras, self._only = job, cameras, only
         self._known: list[dict[tuple[int, ...], np.ndarray]] = [{} for _ in cameras]
         self._pixels = np.zeros((len(cameras), 0), np.int32)
-
-    @cached_property
-    def cells(self) -> Cells:
-        """The cells, as `cells_of`."""
-        return cells_of(self.job)
 
     def measure(self, planned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `compositions_at`."""

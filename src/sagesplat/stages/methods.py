@@ -54,8 +54,9 @@ from sagesplat.stages.shared import distances_from, label_named, observed
 from sagesplat.stages.snapshots import Snapshots
 from sagesplat.stages.viewpoints import fit_viewpoints
 
-_RAISES = 6  # times that a plan is measured in its composition, and its failing levels raised,
-_VIEWPOINTS = 128  # at so many viewpoints
+_RAISES = 6  # times that a plan is measured in its composition, and its failing levels raised
+# at so many viewpoints at most: dinosaur's plans take 18 s (with all 194 38 s, and 0 to 3 % more bytes)
+_VIEWPOINTS = 128
 
 
 class NestedLevels(Method):

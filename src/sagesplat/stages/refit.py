@@ -85,7 +85,7 @@ def _fit_drawn(
     for name, step in (("bias", remove_composition_bias), ("calibration", calibrated)):
         cameras = _some([drawn.cameras[row] for row in drawn.rows(name)], _MOST[name])
         compositions = Compositions(job, cameras, cells.ids.tolist())
-        models = step(models, trial({**known, **models}, compositions), confidence)
+        models = step(models, trial({**known, **models}, all_cells, compositions), confidence)
     return dict(sorted({**known, **models}.items()))
 
 

@@ -129,7 +129,7 @@ def cells_of(job: Job) -> Cells:
     """The cells, in sight from wherever the sampled viewpoints show them."""
     drawn, sampled = viewpoints_of(job), sampled_of(job)
     fit = [drawn.cameras[row] for row in drawn.rows("fit")]
-    return reaching(job.cells, fit, sampled.pixels / sampled.image[:, None])
+    return reaching(job.cells, fit, sampled.shares())
 
 
 def increments_of(job: Job) -> list[Increment]:

@@ -64,7 +64,7 @@ def ssim_document(
 ) -> dict[str, Any]:
     """The document of SSIM against photos, of at least one model. `cameras`: the V photos of `seen`."""
     some = next(iter(models.values()))
-    views = some.inputs_at(np.ones(len(cameras)), *where(cameras, some.focal)[:3])[:, :-1]
+    views = some.inputs_at(np.ones(len(cameras)), *where(cameras, some.focal))[:, :-1]
     rows = {label: _nearest(model.inputs[:, :-1], views) for label, model in models.items()}
     used = np.unique(np.concatenate(list(rows.values())))
     used = used[_path(views[used])]
