@@ -43,7 +43,7 @@ from sagesplat.viewer.built import has_viewer
 from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
-from sagesplat.viewer.pack import Ladder, costs_of, gains_of, order_of
+from sagesplat.viewer.pack import Ladder, costs_of, gains_of, order_of, ranges_of
 from sagesplat.viewer.promises import Seen, allowed_change, fidelity_document, of_cells, ssim_document
 from sagesplat.viewer.quality import (
     curve_entry,
@@ -478,7 +478,11 @@ def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewe
     written = write_bundle(tmp_path / "out", replace(contents, chunks=made.increments), viewer)
     manifest = manifest_of(tmp_path / "out")
     listed = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
-    assert [level["offset"] for level in listed] == [one.offset for one in made.increments]
+    cells = [cell for label in manifest["labels"] for cell in label["cells"]]
+    ranges = [one for cell in cells for one in ranges_of(cell["levels"])]
+    assert [offset for _, offset, _ in ranges] == [one.offset for one in made.increments]
+    assert all(["offset" in one for one in cell["levels"]].index(False) == 1 for cell in cells)
+    assert sum("offset" in one for one in listed) == len(cells)
     assert [level["weight"] for level in listed] == [round(one.weight or 0, 6) for one in made.increments]
     assert {level["format"] for level in listed} == {"stream"}
     assert len(list((tmp_path / "out" / "chunks").iterdir())) == 3
@@ -511,7 +515,8 @@ def test_a_palette_is_the_first_range_of_its_file(tmp_path, contents, viewer) ->
         palette, levels = label["palette"], [one for cell in label["cells"] for one in cell["levels"]]
         content = (tmp_path / "out" / palette["uri"]).read_bytes()
         assert {one["uri"] for one in levels} == {palette["uri"]}
-        assert (palette["offset"], palette["bytes"]) == (0, min(one["offset"] for one in levels))
+        begin = min(one["offset"] for one in levels if "offset" in one)
+        assert (palette["offset"], palette["bytes"]) == (0, begin)
         assert hashlib.sha256(content[: palette["bytes"]]).hexdigest()[:16] == palette["sha256"]
         assert palette["bytes"] + sum(one["bytes"] for one in levels) == len(content)
     uri = made.increments[0].uri

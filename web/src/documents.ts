@@ -129,7 +129,7 @@ export interface Cell {
 export interface Level {
   uri: Path;
   format: Format;
-  /** Of a range: its first byte in the file. Those of a cell touch, from one that replaces those below on; all of a label fill the file. */
+  /** Of a range: its first byte in the file. The first of a cell and those that replace have it; the others follow the one below. All of a label fill the file. */
   offset?: number;
   /** Weight of the second opacities of all Gaussians of the cell where this is its newest level. Without it each has one opacity. */
   weight?: number;

@@ -57,7 +57,7 @@ from sagesplat.viewer.frames import FLIP, upward
 _WHOLE = {0: "scene"}  # the one category of a splat without labels
 _POINTS = 50_000  # means that stand for the points of a capture
 _OPAQUE = 0.1  # their least opacity, as far as there are such
-_STEPS = 1500  # of a training, whose time the sampling of fidelity may take a part of
+_STEPS = 2400  # of a training, whose time the sampling of fidelity may take a part of
 _PARENTS = "parents.json"  # in the capture's folder: of the file's instances
 _LEVEL = 1  # number of the one level that a splat from elsewhere has
 

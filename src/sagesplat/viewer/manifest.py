@@ -251,7 +251,7 @@ def _cells(contents: Contents) -> dict[int, list[dict[str, Any]]]:
     """By label id, the entries of its cells."""
     found: dict[int, list[dict[str, Any]]] = {}
     for row, (cell, label) in enumerate(contents.shown.label_of.items()):
-        levels = [_level(chunk) for chunk in contents.files[cell]]
+        levels = [_level(chunk, i == 0) for i, chunk in enumerate(contents.files[cell])]
         found.setdefault(label, []).append({**placed(contents.shown, row), "levels": levels})
     return found
 
@@ -281,12 +281,13 @@ def placed(cells: Cells, row: int) -> dict[str, Any]:
     }
 
 
-def _level(chunk: Increment) -> dict[str, Any]:
+def _level(chunk: Increment, first: bool) -> dict[str, Any]:
+    begins = chunk.format == "stream" and (first or chunk.refine == "REPLACE")
     return {
         "uri": f"chunks/{chunk.uri}",
         "format": chunk.format,
         **({"refine": "REPLACE"} if chunk.refine == "REPLACE" else {}),
-        **({"offset": chunk.offset} if chunk.format == "stream" else {}),
+        **({"offset": chunk.offset} if begins else {}),  # the others follow
         **({} if chunk.weight is None else {"weight": round(chunk.weight, 6)}),
         "bytes": chunk.nbytes,
         "gpuBytes": chunk.gpu_bytes,

@@ -6,6 +6,7 @@ import {
   type CellPromises,
   type Label,
   type LabelPromises,
+  type Level,
   type Manifest,
   type Promises,
   QUALITIES,
@@ -35,7 +36,7 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
       `${file}: the bundle has version ${version}, this viewer reads version ${VERSION}. Open it with the index.html that came with it.`,
     );
   }
-  const found = checked<Manifest>(value, root, file);
+  const found = placed(checked<Manifest>(value, root, file));
   refuse(
     [
       ...(repeats(found.labels) ? ["labels have the same id twice"] : []),
@@ -47,6 +48,23 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
     file,
   );
   return found;
+}
+
+/** The manifest with the offsets of all ranges: one without follows the one below. */
+function placed(manifest: Manifest): Manifest {
+  const follow = (levels: readonly Level[]): Level[] => {
+    let end = Number.NaN; // none
+    return levels.map((level) => {
+      if (level.format !== "stream") return level;
+      const { offset = level.refine ? Number.NaN : end } = level;
+      end = offset + level.bytes;
+      return { ...level, offset };
+    });
+  };
+  const labels = manifest.labels.map((label) => {
+    return { ...label, cells: label.cells.map((cell) => ({ ...cell, levels: follow(cell.levels) })) };
+  });
+  return { ...manifest, labels };
 }
 
 const repeats = (all: readonly { readonly id: number }[]): boolean =>
@@ -110,7 +128,7 @@ function streamDefects({ labels }: Manifest): string[] {
           odd(ALONE);
         }
       });
-      const touch = levels.every(({ format, refine, offset = Number.NaN }, k) => {
+      const touch = levels.every(({ format, refine, offset }, k) => {
         const below = refine ? undefined : levels[k - 1];
         return format !== "stream" || offset === (below ? (below.offset ?? 0) + below.bytes : offset);
       });

@@ -75,6 +75,16 @@ test("a good manifest is taken as it is, with fields of later versions", () => {
   expect(parseManifest(changed(replacing, "labels.0.cells.2.levels", highest))).toBeTruthy();
 });
 
+test("a range without an offset follows the one below", () => {
+  for (const made of [streams, parted, replacing]) {
+    const short = (level: Level, k: number) => (k && !level.refine ? { ...level, offset: undefined } : level);
+    const labels = made.labels.map((label) => {
+      return { ...label, cells: label.cells.map((cell) => ({ ...cell, levels: cell.levels.map(short) })) };
+    });
+    expect(parseManifest(JSON.stringify({ ...made, labels }))).toEqual(JSON.parse(JSON.stringify(made)));
+  }
+});
+
 test("another version says so, whatever else it holds", () => {
   const document = { format: "sagesplat-bundle", version: VERSION + 1 };
   const message = complaint(() => parseManifest(JSON.stringify(document)));
