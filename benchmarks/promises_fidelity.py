@@ -59,7 +59,8 @@ def measure(
     expected = method.expect(cameras)
     planned = plan_nominal(method.fidelity, expected, costs.transfer_bytes, targets)
     whole_scene = [plan for plan in plans_of(job) if plan.quality == "fidelity"]
-    scenes = np.array([[plan.levels[i] for i in job.cells.labels.tolist()] for plan in whole_scene])
+    by_cell = [plan.levels_of_cells(job.cells.label_of) for plan in whole_scene]
+    scenes = np.array([[levels[cell] for cell in job.cells.ids.tolist()] for levels in by_cell])
     scenes = np.broadcast_to(scenes[None], (views, *scenes.shape))
     filled = method.planned_cells(expected, targets.tolist())
     asked = np.concatenate([planned, _equal(job, views), scenes, filled], 1)
