@@ -630,11 +630,13 @@ def test_promises_are_for_screens_and_a_window_that_changes_is_another(promised:
         return screen
 
     usual = np.tan(np.pi / 6)
-    known = "Promises are for screens of 0.5 to 2 times the photos' sharpness"
     said = "document.querySelector('.screens').textContent"
     with open_page(promised, (900, 640), browser=browser) as opened:
         ready(opened)
         averaged = round(640 * 2 / here(640, usual))
+        widest = opened.page.evaluate("Math.floor(sagesplat.state().screens.widest)")
+        assert 30 < widest < 140
+        known = f"Promises are for screens of 0.5 to 2 times the photos' sharpness and lenses up to {widest}°"
         opened.wait_for(f'{said} === "{known}; compared as averaged down to {averaged} px"')
         for width, height in ((900, 400), (360, 640)):  # the second as on a phone that was turned
             opened.page.set_viewport_size({"width": width, "height": height})
