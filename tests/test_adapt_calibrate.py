@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagesplat.adapt.calibrate import (
+    OTHERS,
     conformal_quantile,
     critical_margins,
     critical_nominals,
@@ -32,6 +33,27 @@ def test_the_quantile_is_kept_by_new_values():
     rng = np.random.default_rng(0)
     kept = [rng.exponential() <= conformal_quantile(rng.exponential(size=39), 0.9) for _ in range(4000)]
     assert 0.9 - 0.01 < np.mean(kept) < 0.9 + 0.025 + 0.01
+
+
+def test_other_categories_make_the_quantile_of_few_values_less_a_matter_of_chance():
+    rng = np.random.default_rng(1)
+    draws = [(rng.exponential(size=40), rng.exponential(size=280)) for _ in range(2000)]
+    alone, shared = np.transpose([
+        [1 - np.exp(-conformal_quantile(own, 0.95, other)) for other in (np.zeros(0), others)]
+        for own, others in draws
+    ])  # fmt: skip
+    assert shared.std() < 0.8 * alone.std()
+    assert 0.95 < shared.mean() < 0.97
+
+
+@given(st.integers(40, 200), st.integers(0, 400))
+def test_other_categories_count_as_a_few_values_however_easy_or_hard_they_are(n, m):
+    own = np.arange(1.0, n + 1)
+    easy, hard = (conformal_quantile(own, 0.95, np.full(m, value)) for value in (-1.0, n + 2.0))
+    few = 0.05 * min(m, OTHERS)
+    assert conformal_quantile(own, 0.95) - few - 1 <= easy <= conformal_quantile(own, 0.95) <= hard
+    # of the own values at most so many more are above
+    assert (own > easy).sum() <= 0.05 * (n + min(m, OTHERS) + 1)
 
 
 @settings(max_examples=60)

@@ -7,8 +7,10 @@ keeps the target in a new view at a confidence: the ceil((n + 1) confidence)-th 
 on each number this counts what is decided only; where levels are far apart it costs almost nothing.
 
 Views are the unit: those of one capture are drawn independently, the categories of one view are not. A
-category has its own thresholds, and each target has its own. With fewer than 19 views (at 0.95) not even the
-largest is enough: "uncalibrated", widened to the largest of all categories.
+category has its own thresholds, and each target has its own. Of 46 views just one or two are above such a
+threshold, so chance moves it: the other categories' views together count as `OTHERS` more (after Ding et al.
+2023, "Class-conditional conformal prediction with many classes"). With fewer than 19 views (at 0.95) of its
+own not even the largest is enough: "uncalibrated", widened to the largest of all categories.
 
 Away from the photos a mean is less certain, and misses by more. So the threshold is the target and a margin
 that is proportional to `AT_A_PHOTO + away` (`adapt.viewpoint`); it is the margin that is calibrated.
@@ -22,7 +24,12 @@ import math
 import numpy as np
 from jaxtyping import Float, Int
 
+# Calibration sets of 46 of 160 viewpoints of two built-in captures, drawn 300 times, the rest to test: with
+# 0, 10, 20, 40 and 60 of them 7.2, 4.3, 4.1, 5.8 and 7.4 % of the categories keep less than 0.9 where 0.95
+# was asked for; thresholds are on average as they are with 0, or lower.
+OTHERS = 20.0
 AT_A_PHOTO = 0.2  # of the margin there, over what it grows by to far from all photos
+NO_OTHERS = np.zeros(0)
 
 
 def fewest_views(confidence: float) -> int:
@@ -30,10 +37,19 @@ def fewest_views(confidence: float) -> int:
     return math.ceil(confidence / (1 - confidence) - 1e-9)
 
 
-def conformal_quantile(values: Float[np.ndarray, " n"], confidence: float) -> float:
-    """The value that a new one does not exceed at a confidence; inf from too few values."""
-    rank = math.ceil((len(values) + 1) * confidence - 1e-9)
-    return float(np.sort(values)[rank - 1]) if rank <= len(values) else math.inf
+def conformal_quantile(
+    values: Float[np.ndarray, " n"], confidence: float, others: Float[np.ndarray, " m"] = NO_OTHERS
+) -> float:
+    """The value that a new one does not exceed at a confidence; inf from too few values.
+
+    `others`: of other categories, which together count as at most `OTHERS` values.
+    """
+    weight = np.ones(len(values) + len(others))
+    weight[len(values) :] = min(OTHERS / max(len(others), 1), 1)
+    ordered = np.concatenate([values, others])
+    order = np.argsort(ordered)
+    enough = np.cumsum(weight[order]) >= (weight.sum() + 1) * confidence - 1e-9
+    return float(ordered[order][enough.argmax()]) if enough.any() else math.inf
 
 
 def critical_margins(

@@ -14,7 +14,7 @@ Three sets of drawn viewpoints are used, each for one thing:
    done twice.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -262,6 +262,28 @@ def trial_of(
 
 
 @dataclass(frozen=True, eq=False)
+class Decisions:
+    """What the viewpoints that show a category say of it."""
+
+    critical: Float[np.ndarray, "G n"]  # for each of TARGETS the critical nominal target
+    away: Float[np.ndarray, " n"]
+
+    @property
+    def near(self) -> Bool[np.ndarray, " n"]:
+        """Which viewpoints are on the capture's path."""
+        return self.away < _NEAR
+
+    def kinds(self, fewest: int) -> tuple[bool | None, ...]:
+        """On the path and off it, if there are enough viewpoints of both to look at them apart; else all."""
+        near = int(self.near.sum())
+        return (True, False) if min(near, len(self.away) - near) >= fewest else (None,)
+
+    def at(self, kind: bool | None) -> Float[np.ndarray, "G m"]:
+        """`critical` of the viewpoints on the path (True), off it (False), or of all (None)."""
+        return self.critical if kind is None else self.critical[:, self.near == kind]
+
+
+@dataclass(frozen=True, eq=False)
 class Trial:
     """Compositions planned for NOMINAL at viewpoints of one set, and what they measured."""
 
@@ -284,6 +306,10 @@ class Trial:
         steps = self.steps[rows, :, column]
         return np.stack([critical_nominals(NOMINAL, bound, steps, got, target) for target in TARGETS])
 
+    def decisions(self, label: int) -> Decisions:
+        """What the viewpoints say of a category."""
+        return Decisions(self.critical(label), self.away[self.views(label)])
+
     def missed(self, label: int) -> Int[np.ndarray, " J"]:
         """In how many of these viewpoints each of NOMINAL was missed."""
         rows = self.views(label)
@@ -304,35 +330,27 @@ def remove_composition_bias(
     one threshold for all would keep more than is asked on the path, and less among the cameras.
     This is no calibration: it brings what is calibrated close to what is asked.
     """
-    return {
-        label: _by_place(
-            model, trial.critical(label), trial.away[trial.views(label)], _FEW,
-            lambda critical: _empirical(critical, confidence),
-        )
-        if len(trial.views(label))
-        else model
-        for label, model in models.items()
-    }  # fmt: skip
+    found = dict(models)
+    for label, model in models.items():
+        if len(trial.views(label)):
+            decisions = trial.decisions(label)
+            asked = [_empirical(decisions.at(kind), confidence) for kind in decisions.kinds(_FEW)]
+            found[label] = _by_place(model, decisions, asked)
+    return found
 
 
 def _by_place(
-    model: FidelityModel,
-    critical: Float[np.ndarray, "G n"],
-    away: Float[np.ndarray, " n"],
-    fewest: int,
-    asked: Callable[[Float[np.ndarray, "G n"]], Float[np.ndarray, " G"]],
+    model: FidelityModel, decisions: "Decisions", asked: Sequence[Float[np.ndarray, " G"]]
 ) -> FidelityModel:
     """The model with thresholds that go linearly from what viewpoints on the path need to what others do.
 
-    `asked`: what to ask for TARGETS, from the critical nominal targets of some of the viewpoints. All count
-    together where there are fewer than `fewest` of either kind.
+    `asked`: what to ask for TARGETS: of all viewpoints, or of those on the path and of those off it.
     """
-    sides = [away < _NEAR, away >= _NEAR]
-    if min(side.sum() for side in sides) < fewest:
-        return _asked(model, asked(critical))
-    needs, places = [], [float(away[side].mean()) for side in sides]
-    for side, place in zip(sides, places, strict=True):
-        thresholds, slopes = _needs(model, asked(critical[:, side]))
+    if len(asked) == 1:
+        return _asked(model, asked[0])
+    needs, places = [], [float(decisions.away[decisions.near == kind].mean()) for kind in (True, False)]
+    for nominal, place in zip(asked, places, strict=True):
+        thresholds, slopes = _needs(model, nominal)
         needs.append(np.minimum(thresholds + slopes * place, 1))
     slopes = (needs[1] - needs[0]) / (places[1] - places[0])
     return _with_needs(model, needs[0] - slopes * places[0], slopes)
@@ -389,22 +407,26 @@ def calibrated(
         of all categories and of its own: "uncalibrated".
     """
     fewest = fewest_views(confidence)
+    decisions = {label: trial.decisions(label) for label in models}
 
-    def conformal(critical: Float[np.ndarray, "G n"]) -> Float[np.ndarray, " G"]:
-        values = np.array([conformal_quantile(values, confidence) for values in critical])
+    def conformal(label: int, kind: bool | None) -> Float[np.ndarray, " G"]:
+        of_others = [one.at(kind) for other, one in decisions.items() if other != label]
+        others = np.hstack([np.zeros((len(TARGETS), 0)), *of_others])
+        rows = zip(decisions[label].at(kind), others, strict=True)
+        values = np.array([conformal_quantile(own, confidence, other) for own, other in rows])
         return np.where(held, np.maximum(values, TARGETS), values)
 
-    critical = {label: trial.critical(label) for label in models}
-    asked = {label: conformal(found) for label, found in critical.items() if found.shape[1] >= fewest}
+    asked = {label: conformal(label, None) for label, one in decisions.items() if len(one.away) >= fewest}
     # nothing is known below the last level where not even one category could be calibrated
     widest = np.max([*asked.values()], axis=0) if asked else np.ones(len(TARGETS))
     found = {}
     for label, model in models.items():
-        views = critical[label].shape[1]
+        mine = decisions[label]
+        views = len(mine.away)
         if label in asked:
-            made = _by_place(model, critical[label], trial.away[trial.views(label)], fewest, conformal)
+            made = _by_place(model, mine, [conformal(label, kind) for kind in mine.kinds(fewest)])
         else:
-            made = _asked(model, np.maximum(widest, critical[label].max(1)) if views else widest)
+            made = _asked(model, np.maximum(widest, mine.critical.max(1)) if views else widest)
         status = "calibrated" if label in asked else "uncalibrated"
         least = model.calibration.least_support
         least = min(least, trial.least_support(label)) if views else least
