@@ -32,7 +32,7 @@ from sagesplat.adapt.cells import POINTS, Cells, describe_cells
 from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, ViewModel
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.increments import totals, write_increments
+from sagesplat.formats.increments import ranges_of, totals, write_increments
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
 from sagesplat.formats.stream_header import AS_GIVEN
@@ -43,7 +43,7 @@ from sagesplat.viewer.built import has_viewer
 from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
-from sagesplat.viewer.pack import Ladder, costs_of, gains_of, order_of, ranges_of
+from sagesplat.viewer.pack import Ladder, costs_of, gains_of, order_of
 from sagesplat.viewer.promises import Seen, allowed_change, fidelity_document, of_cells, ssim_document
 from sagesplat.viewer.quality import (
     curve_entry,
@@ -479,8 +479,9 @@ def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewe
     manifest = manifest_of(tmp_path / "out")
     listed = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
     cells = [cell for label in manifest["labels"] for cell in label["cells"]]
-    ranges = [one for cell in cells for one in ranges_of(cell["levels"])]
-    assert [offset for _, offset, _ in ranges] == [one.offset for one in made.increments]
+    sent = [[(one["uri"], one.get("offset"), one["bytes"]) for one in cell["levels"]] for cell in cells]
+    ranges = [offset for some in sent for _, offset, _ in ranges_of(some)]
+    assert ranges == [one.offset for one in made.increments]
     assert all(["offset" in one for one in cell["levels"]].index(False) == 1 for cell in cells)
     assert sum("offset" in one for one in listed) == len(cells)
     assert [level["weight"] for level in listed] == [round(one.weight or 0, 6) for one in made.increments]

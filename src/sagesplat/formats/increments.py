@@ -8,7 +8,7 @@ stream begins with each of these, so that none needs the bytes of what it replac
 
 import hashlib
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby, pairwise
 from operator import itemgetter
@@ -247,6 +247,18 @@ def full_scene(listed: Sequence[Increment]) -> list[Increment]:
         if one.refine == "REPLACE":
             newest[one.cell] = max(newest.get(one.cell, 0), one.level)
     return [one for one in listed if one.level >= newest.get(one.cell, 0)]
+
+
+def ranges_of(levels: Iterable[tuple[str, int | None, int]]) -> list[tuple[str, int, int]]:
+    """File, first byte and bytes of a cell's levels in a manifest.
+
+    One that does not say where it begins follows the one below in the same file, or is a file of its own.
+    """
+    found: list[tuple[str, int, int]] = []
+    for uri, offset, nbytes in levels:
+        follows = sum(found[-1][1:]) if found and found[-1][0] == uri else 0
+        found.append((uri, follows if offset is None else offset, nbytes))
+    return found
 
 
 def totals(listed: Sequence[Increment], cells: Sequence[int], levels: int, what: str) -> np.ndarray:

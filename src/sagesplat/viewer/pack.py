@@ -25,6 +25,7 @@ from jaxtyping import Float, Int
 from sagesplat.adapt.cell_models import LEAST_SHARE, FidelityModel, expect, needed
 from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.cells import Cells
+from sagesplat.formats.increments import ranges_of
 from sagesplat.scene.scene import Camera
 
 # of the first view, as in the viewer on a usual screen
@@ -110,7 +111,11 @@ def write_pack(
 ) -> dict[str, Any]:
     """Write increments of a manifest's labels, which are in `folder`, as one pack; its manifest entry."""
     unnamed, digest, size = folder / "scene.pack", hashlib.sha256(), 0
-    levels = {cell["id"]: ranges_of(cell["levels"]) for label in labels for cell in label["cells"]}
+    levels = {
+        cell["id"]: ranges_of([(one["uri"], one.get("offset"), one["bytes"]) for one in cell["levels"]])
+        for label in labels
+        for cell in label["cells"]
+    }
     with unnamed.open("wb") as file:
         for cell, level in order:
             uri, offset, nbytes = levels[cell][level - 1]
@@ -122,15 +127,6 @@ def write_pack(
     uri = f"scene-{digest.hexdigest()[:12]}.pack"
     unnamed.replace(folder / uri)
     return {"uri": uri, "bytes": size, "sha256": digest.hexdigest(), "order": [list(one) for one in order]}
-
-
-def ranges_of(levels: Sequence[dict[str, Any]]) -> list[tuple[str, int, int]]:
-    """File, first byte and bytes of the levels of a manifest's cell; streams without an offset follow."""
-    found: list[tuple[str, int, int]] = []
-    for entry in levels:
-        follows = found[-1][1] + found[-1][2] if found and entry["format"] == "stream" else 0
-        found.append((entry["uri"], entry.get("offset", follows), entry["bytes"]))
-    return found
 
 
 def beginning_of(manifest: Mapping[str, Any]) -> int:

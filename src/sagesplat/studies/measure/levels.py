@@ -15,7 +15,15 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.geometry import NO_OFFSET, Position
 from sagesplat.core.limits import AtLeast1, Count, LabelId, Share
 from sagesplat.core.names import repaired
-from sagesplat.formats.increments import INDEX, Increment, Refine, read_increments, read_index, shown
+from sagesplat.formats.increments import (
+    INDEX,
+    Increment,
+    Refine,
+    ranges_of,
+    read_increments,
+    read_index,
+    shown,
+)
 from sagesplat.formats.lod_meta import LOD_META, level_files
 from sagesplat.formats.sog import META
 from sagesplat.formats.splat import cleaned
@@ -108,20 +116,28 @@ class _BundleLevel:
     gpuBytes: AtLeast1
     sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{16,64}\Z")]
     refine: Refine = "ADD"
-    offset: Count = 0
+    offset: Count | None = None
     weight: Share | None = None
 
-    def increment(self, label_id: int, cell: int, number: int) -> Increment:
+    def increment(self, label_id: int, cell: int, number: int, offset: int) -> Increment:
         uri = self.uri.removeprefix("chunks/")
         sizes = self.count, self.bytes, self.gpuBytes
         digits = self.sha256.ljust(64, "0")  # a manifest has the first; nothing here compares them
-        return Increment(label_id, cell, number, uri, *sizes, digits, self.refine, self.offset, self.weight)
+        return Increment(label_id, cell, number, uri, *sizes, digits, self.refine, offset, self.weight)
 
 
 @dataclass(frozen=True)
 class _BundleCell:
     id: LabelId
     levels: list[_BundleLevel]
+
+    def increments(self, label_id: int) -> list[Increment]:
+        ranges = ranges_of((one.uri, one.offset, one.bytes) for one in self.levels)
+        levels = zip(self.levels, ranges, strict=True)
+        return [
+            level.increment(label_id, self.id, number, offset)
+            for number, (level, (_, offset, _)) in enumerate(levels, 1)
+        ]
 
 
 @dataclass(frozen=True)
@@ -143,10 +159,10 @@ def _of_bundle(path: Path, name: str) -> list[Level]:
     names = {label.id: repaired(label.title, "?") for label in manifest.labels}
     with refused(file, what, _BUNDLE_CURE):
         made = [
-            asdict(level.increment(label.id, cell.id, number))
+            asdict(one)
             for label in manifest.labels
             for cell in label.cells
-            for number, level in enumerate(cell.levels, 1)
+            for one in cell.increments(label.id)
         ]
         listed = convert_as(made, list[Increment])
     return _of_chunks(path / "chunks", listed, names, name, manifest.antialiased is True)
