@@ -252,11 +252,11 @@ def full_scene(listed: Sequence[Increment]) -> list[Increment]:
 def ranges_of(levels: Iterable[tuple[str, int | None, int]]) -> list[tuple[str, int, int]]:
     """File, first byte and bytes of a cell's levels in a manifest.
 
-    One that does not say where it begins follows the one below in the same file, or is a file of its own.
+    A part of a stream that does not say where it begins follows the one below; others are files.
     """
     found: list[tuple[str, int, int]] = []
     for uri, offset, nbytes in levels:
-        follows = sum(found[-1][1:]) if found and found[-1][0] == uri else 0
+        follows = sum(found[-1][1:]) if found and uri.endswith(STREAM) else 0
         found.append((uri, follows if offset is None else offset, nbytes))
     return found
 
