@@ -189,6 +189,14 @@ def test_levels_are_a_file_of_streams_for_each_category(adopted: Path) -> None:
     assert any(one.refine == "REPLACE" for one in listed)
 
 
+def test_categories_have_as_many_cells_as_asked_for(tmp_path: Path) -> None:
+    write_ply(tmp_path / "ball.ply", random_gaussians(2400, degree=0, logit=2.0))
+    for cells in (0, 8):
+        asked = replace(SMALL, cells=cells)
+        job, _ = _levels(tmp_path / str(cells), tmp_path / "ball.ply", asked)
+        assert (len(job.cells.ids) > len(set(job.cells.labels))) == (cells > 0)
+
+
 @pytest.mark.parametrize("fit", ["none", pytest.param("renders", marks=pytest.mark.slow)])
 def test_lossless_is_identical(tmp_path: Path, fit: Any) -> None:
     before = replace(_ball(labels=False), quats=_ball().quats * 3)  # of any length

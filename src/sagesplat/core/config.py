@@ -14,6 +14,7 @@ PositiveInt31 = Annotated[int, Meta(ge=1, le=_MOST)]
 Downscale = Annotated[int, Meta(ge=0, le=1024)]
 BelowOne = Annotated[float, Meta(ge=0, lt=1)]
 Side = Annotated[int, Meta(ge=1, le=4096)]  # pixels
+NumCells = Annotated[int, Meta(ge=0, le=4096)] | Literal["auto"]
 Viewpoints = Annotated[int, Meta(ge=0, le=10_000)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]
 SomeViewpoints = Annotated[int, Meta(ge=1, le=10_000)]
@@ -201,7 +202,7 @@ class NestConfig:
     lowest levels; 0: none."""
     base_steps: PositiveInt31 = 1600
     """Training steps of the base model, which begins with the trained model, merged to that size."""
-    cells: Annotated[int, Meta(ge=0, le=4096)] | Literal["auto"] = "auto"
+    cells: NumCells = "auto"
     """Parts of categories by place, in all, that have levels of their own, at least one in each block;
     0: each category is one (auto: by the number of Gaussians, at most 64)."""
     rate_weight: NotNegative = 6e-4
@@ -221,6 +222,9 @@ class AdoptConfig:
     shares: LevelShares = (0.004, 0.008, 0.016, 0.031, 0.0625, 0.125, 0.25, 0.5, 0.7, 1.0)
     """Sizes of the levels, as fractions of all Gaussians; categories that lose less keep fewer. Levels of
     fewer than 50 Gaussians are left out."""
+    cells: NumCells = "auto"
+    """Parts of categories by place, in all, that have levels of their own; 0: each category is one (auto: by
+    the number of Gaussians, at most 64)."""
     lossless: bool = False
     """Send the highest levels as PLY, not rounded: the last one is then identical to the file."""
     cameras: Path | None = None

@@ -64,7 +64,8 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     g = job.load_last_level()
     shares = usable_shares(config.shares, len(g))
     steps = config.steps if config.fit == "renders" else 0
-    settings = asdict(NestConfig(steps=steps, levels=len(shares), base_share=0, rate_weight=0.0))
+    made_as = NestConfig(steps=steps, levels=len(shares), base_share=0, cells=config.cells, rate_weight=0.0)
+    settings = asdict(made_as)
     settings |= {"fit": config.fit, "shares": shares, "lossless": config.lossless, "seed": config.seed}
     settings |= {"increments": "streams"}  # once they were SPZ files
     inputs = [run.scene, run.labels, run.levels, run.provenance("train"), *label_image_inputs(run)]
@@ -73,7 +74,7 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
         if config.fit == "renders":
             check_nest(job, len(g), g.sh_degree)
         ladder, num_lower = _ladder(job, g, shares, config, checkpoint_key(run, settings, inputs))
-        ladder, label_of = in_cells(ladder, cells_wanted(len(g)))
+        ladder, label_of = in_cells(ladder, cells_wanted(len(g)) if config.cells == "auto" else config.cells)
         rows, space = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace()
         came_in = [(row, _image(job, g, row, space)) for row in rows]
         precision = None if config.lossless else _precision(job, g, came_in)
