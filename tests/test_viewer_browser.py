@@ -634,9 +634,9 @@ def test_promises_are_for_screens_and_a_window_that_changes_is_another(promised:
     with open_page(promised, (900, 640), browser=browser) as opened:
         ready(opened)
         averaged = round(640 * 2 / here(640, usual))
-        widest = opened.page.evaluate("Math.floor(sagesplat.state().screens.widest)")
-        assert 30 < widest < 140
-        known = f"Promises are for screens of 0.5 to 2 times the photos' sharpness and lenses up to {widest}°"
+        shorter = min(camera().width, camera().height) / camera().focal
+        fov = round(np.degrees(2 * np.arctan(shorter / 2)))
+        known = f"Promises are for screens of 0.5 to 2 times the photos' sharpness and lenses up to {fov}°"
         opened.wait_for(f'{said} === "{known}; compared as averaged down to {averaged} px"')
         for width, height in ((900, 400), (360, 640)):  # the second as on a phone that was turned
             opened.page.set_viewport_size({"width": width, "height": height})

@@ -227,6 +227,8 @@ def test_compositions_are_promised_no_more_than_before_they_were_sent(labels, vi
     files = {cell: [1, 2, 3, 4, 5] for cell in cells.ids.tolist()}
     cost = np.tile(np.arange(1, 6) * 1000, (len(labels), 1))
     document = json.loads(json.dumps(fidelity_document(models, files, 5, cells, cost, drawn)))
+    shorter = [2 * np.degrees(np.arctan(min(one.width, one.height) / 2 / one.focal)) for one in drawn]
+    assert document["fov"] == round(max(shorter))
     read = read_fidelity(document)
     before, after = (expect(some, cells, drawn, 5) for some in (models, read))
     rng = np.random.default_rng(seed)

@@ -186,6 +186,8 @@ export interface Promises {
   focal: number;
   /** Screens that promises are for, from and to; others count as the nearer end. */
   screens: [number, number];
+  /** Of fidelity: the widest lens that was tried, degrees of the picture's shorter side. */
+  fov?: number;
   /** By axis (x y z over the extent, direction, log screen, log field) and view, in 1/10000. */
   views: [Steps, Steps, Steps, Steps, Steps, Steps, Steps, Steps];
   /** Photos that thresholds rise away from, as views without a screen. None: the views of a label. */

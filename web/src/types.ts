@@ -124,7 +124,7 @@ export interface Screens {
   readonly least: number;
   readonly most: number; // a larger one is promised what its picture has, averaged down to this
   readonly here: number; // of the present viewpoint
-  readonly widest: number; // lens, degrees of a square picture; NaN: the photos'
+  readonly fov?: number | undefined; // of the widest lens, degrees of the shorter side; none: the photos'
 }
 
 export interface State {

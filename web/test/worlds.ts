@@ -295,6 +295,7 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
     extent: 5,
     focal: FOCAL,
     screens: [0.5, 2],
+    fov: 53,
     views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6), column(7)],
     photos: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) =>

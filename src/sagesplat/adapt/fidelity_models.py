@@ -340,7 +340,7 @@ def remove_composition_bias(
 
 
 def _by_place(
-    model: FidelityModel, decisions: "Decisions", asked: Sequence[Float[np.ndarray, " G"]]
+    model: FidelityModel, decisions: Decisions, asked: Sequence[Float[np.ndarray, " G"]]
 ) -> FidelityModel:
     """The model with thresholds that go linearly from what viewpoints on the path need to what others do.
 

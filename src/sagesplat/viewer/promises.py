@@ -112,7 +112,7 @@ def fidelity_document(
         last: The last of the nested levels.
         cells: All of the bundle.
         cost: Bytes of their levels (`costs_of`).
-        cameras: Viewpoints where compositions' means are compared with what is sent of them.
+        cameras: At least one viewpoint, where compositions' means are compared with what is sent of them.
     """
     some = next(iter(models.values()))
     order = _path(some.views)
@@ -135,7 +135,9 @@ def fidelity_document(
             ],
         }
         entries.append(entry)
-    document = {**head, "labels": entries}
+    widest = max(min(camera.width, camera.height) / camera.focal for camera in cameras)
+    fov = math.floor(math.degrees(2 * math.atan(widest / 2)) + 0.5)
+    document = {**head, "fov": fov, "labels": entries}
     kept = of_cells(models, files, last)
     before, after = (expect(some, cells, cameras, cost.shape[1]) for some in (kept, read_fidelity(document)))
     changes = _changes(kept, before, after, cost)

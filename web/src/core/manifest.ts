@@ -36,7 +36,7 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
       `${file}: the bundle has version ${version}, this viewer reads version ${VERSION}. Open it with the index.html that came with it.`,
     );
   }
-  const found = placed(checked<Manifest>(value, root, file));
+  const found = withOffsets(checked<Manifest>(value, root, file));
   refuse(
     [
       ...(repeats(found.labels) ? ["labels have the same id twice"] : []),
@@ -51,7 +51,7 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
 }
 
 /** The manifest with the offsets of all ranges: one without follows the one below. */
-function placed(manifest: Manifest): Manifest {
+function withOffsets(manifest: Manifest): Manifest {
   const follow = (levels: readonly Level[]): Level[] => {
     let end = Number.NaN; // none
     return levels.map((level) => {

@@ -90,13 +90,6 @@ const COLUMNS = 8; // of the shared views: position over the extent, direction, 
 const PHOTO_COLUMNS = 6; // of the photos: position and direction
 const PLACE_LENGTHS = [0.3, 0.5] as const; // of position and direction, for photos and factors
 
-/** The widest lens of the views that models learnt from, in degrees of a square picture; NaN: the photos'. */
-export function widestOf({ quality, views }: Pick<Promises, "quality" | "views">): number {
-  if (quality === "ssim") return Number.NaN;
-  const field = Math.exp(Math.max(...sums(views[COLUMNS - 1] ?? [], STEP)));
-  return (2 * Math.atan(field / 2) * 180) / Math.PI;
-}
-
 /** The views that the models of all labels share, and how far they are from the current viewpoint. */
 export class Views {
   readonly away: Float64Array; // [V] square of the distance over the extent

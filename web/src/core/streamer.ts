@@ -22,7 +22,7 @@ import { parsePromises } from "./manifest";
 import { inOrder } from "./order";
 import { Pack } from "./pack";
 import { makePlan, type Plan } from "./planner";
-import { screenOf, widestOf } from "./quality";
+import { screenOf } from "./quality";
 import { type Drawn, type Entry, entriesOf, exchange, gpuBytesOf, Hidden, settle } from "./residency";
 import { type Family, familiesOf, ViewpointModels } from "./viewpoints";
 
@@ -485,7 +485,7 @@ export class Streamer {
     const { promises } = this.models;
     if (!promises) return null;
     const [least, most] = promises.screens;
-    return { least, most, here: screenOf(this.viewpoint, promises), widest: widestOf(promises) };
+    return { least, most, here: screenOf(this.viewpoint, promises), fov: promises.fov };
   }
 
   private describe(): State {

@@ -29,20 +29,21 @@ export function formatDistance(metres: number): string {
 export const nameOf = (quality: Quality): string => (quality === "fidelity" ? "fidelity" : "SSIM");
 
 /**
- * The screens and lenses that promises are for. A larger one is promised what its picture has, averaged down to the largest.
+ * The screens and lenses that promises are for. A larger screen is promised what its
+ * picture has, averaged down to the largest.
  *
  * @param height - of what is drawn, pixels
  * @param photos - what they are called
  */
 export function formatScreens(
-  { least, most, here, widest }: Screens,
+  { least, most, here, fov }: Screens,
   height: number,
   photos = "photos",
 ): string {
   const from = least < most ? `${Number(least.toPrecision(2))} to ` : "";
   const times = `of ${from}${Number(most.toPrecision(2))} times the ${photos}' sharpness`;
   const screens = least === 1 && most === 1 ? `as sharp as the ${photos}` : times;
-  const lenses = widest > 0 ? ` and lenses up to ${Math.floor(widest)}°` : "";
+  const lenses = fov === undefined ? "" : ` and lenses up to ${fov}°`;
   const known = `Promises are for screens ${screens}${lenses}`;
   const averaged = `; compared as averaged down to ${Math.round((height * most) / here)} px`;
   return here > most ? known + averaged : known;

@@ -3,12 +3,12 @@ import { formatLook, formatName, formatScreens } from "../../src/ui/format";
 
 test("promises name the screens that they are for", () => {
   const known = "Promises are for screens of 0.5 to 2 times the photos' sharpness";
-  const screens = { least: 0.5, most: 2, here: 1.2, widest: Number.NaN };
+  const screens = { least: 0.5, most: 2, here: 1.2 };
   expect(formatScreens(screens, 900)).toBe(known);
   expect(formatScreens({ ...screens, here: 2 }, 900)).toBe(known);
   expect(formatScreens({ ...screens, here: 3 }, 1800)).toBe(`${known}; compared as averaged down to 1200 px`);
-  expect(formatScreens({ ...screens, widest: 100.6 }, 900)).toBe(`${known} and lenses up to 100°`);
-  const photos = { least: 1, most: 1, here: 0.4, widest: Number.NaN };
+  expect(formatScreens({ ...screens, fov: 100 }, 900)).toBe(`${known} and lenses up to 100°`);
+  const photos = { least: 1, most: 1, here: 0.4 };
   expect(formatScreens(photos, 900)).toBe("Promises are for screens as sharp as the photos");
   expect(formatScreens({ ...photos, here: 1.5 }, 900)).toContain("averaged down to 600 px");
   expect(formatScreens({ ...photos, least: 1.5, most: 1.5 }, 900)).toContain("screens of 1.5 times");
@@ -28,7 +28,7 @@ test("a fidelity is said in words, of SSIM against photos nothing is", () => {
 });
 
 test("an adopted scene has viewpoints, and no photos", () => {
-  expect(formatScreens({ least: 0.5, most: 2, here: 1, widest: 90 }, 900, "viewpoints")).toBe(
+  expect(formatScreens({ least: 0.5, most: 2, here: 1, fov: 90 }, 900, "viewpoints")).toBe(
     "Promises are for screens of 0.5 to 2 times the viewpoints' sharpness and lenses up to 90°",
   );
 });
