@@ -12,7 +12,6 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from sagesplat.core.gaussians import PARAMETERS
 from sagesplat.kernels.jit import njit
 from sagesplat.raster.reference import rotation_matrices
 from sagesplat.train import densify
@@ -54,8 +53,8 @@ def shares(logits: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
 def relocate(state: TrainState, trainable: Tensor) -> int:
     """Move dead Gaussians, opacity at most `PRUNE_OPACITY`, onto living ones; returns how many.
 
-    Hosts are drawn by opacity. A relocated Gaussian copies its host, label included, and the
-    moments of both are reset. Rows that are not `trainable` (bool [N]) are neither moved nor hosts: a stopped
+    Hosts are drawn by opacity and keep their moments. A relocated Gaussian copies its host, label included;
+    its moments begin anew. Rows that are not `trainable` (bool [N]) are neither moved nor hosts: a stopped
     category keeps its dead ones. Without a living Gaussian nothing moves. Changes tensors in place.
     """
     alive = state.gaussians.logit_opacities.sigmoid() > PRUNE_OPACITY
@@ -95,7 +94,11 @@ def add(state: TrainState, most: int, trainable: Tensor, growth: float = _GROWTH
 
 
 def _land(state: TrainState, living: Tensor, count: int) -> Tensor:
-    """Hosts [count] of as many Gaussians, already with the opacity and scales of their share."""
+    """Hosts [count] of as many Gaussians, already with the opacity and scales of their share.
+
+    Their moments stay, unlike as published: late in a training Adam's first steps after a reset are three
+    times too long, and many are hosts at every refinement.
+    """
     g, rows = state.gaussians, living.nonzero().squeeze(1)
     if not count or not len(rows):
         return rows[:0]
@@ -108,9 +111,6 @@ def _land(state: TrainState, living: Tensor, count: int) -> Tensor:
     lowest = float(torch.logit(torch.tensor(PRUNE_OPACITY)))  # a share no fainter, as in gsplat
     g.logit_opacities[places] = logits.clamp_min(lowest).float()
     g.log_scales[places] += log_factors[:, None].float()
-    for name in PARAMETERS:
-        state.exp_avg[name][places] = 0
-        state.exp_avg_sq[name][places] = 0
     return hosts
 
 
