@@ -167,7 +167,7 @@ def test_gradients_are_observed_in_half_images():
 
 
 def test_schedule_is_the_published_one_at_full_length():
-    plan = schedule_of(TrainConfig(max_steps=30_000))
+    plan = schedule_of(TrainConfig(max_steps=30_000, lr_schedule="published"))
     published = Schedule(
         level_every=1000,
         refine_start=500,
@@ -180,12 +180,13 @@ def test_schedule_is_the_published_one_at_full_length():
 
 
 @pytest.mark.parametrize(("steps", "stop"), [(900, 630), (2000, 1200), (3000, 1500), (30_000, 15_000)])
-def test_short_runs_of_the_fast_pace_grow_for_longer(steps, stop):
+def test_the_fast_pace_grows_for_longer_in_short_runs_and_never_resets(steps, stop):
     fast, published = (
         schedule_of(TrainConfig(max_steps=steps, lr_schedule=pace)) for pace in ("fast", "published")
     )
     assert fast.refine_stop == stop
-    assert replace(fast, refine_stop=published.refine_stop) == published
+    assert not any(map(fast.resets, range(steps)))
+    assert fast == replace(published, refine_stop=stop, reset_every=0, recovery=0)
 
 
 def test_room_of_stopped_categories_is_not_given_away():

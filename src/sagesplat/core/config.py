@@ -125,8 +125,8 @@ class TrainConfig:
     max_steps: Annotated[int, Meta(ge=1, le=10**9)] = 7000
     """Training steps."""
     lr_schedule: Literal["fast", "published"] = "fast"
-    """Learning rates. fast: larger at first, on downscaled photos where those have the same detail;
-    published: as in 3DGS."""
+    """Learning rates. fast: larger at first, on downscaled photos where those have the same detail, and no
+    opacity resets; published: as in 3DGS."""
     level_every: Annotated[int, Meta(ge=0, le=10**9)] = 0
     """Steps between two recorded levels, not scaled (0: a thirtieth of --train.max-steps)."""
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = 3

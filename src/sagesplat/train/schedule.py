@@ -19,7 +19,7 @@ class Schedule:
     level_every: int
     refine_start: int
     refine_stop: int
-    reset_every: int
+    reset_every: int  # steps between two opacity resets; 0: none
     raise_sh_every: int
     recovery: int  # steps after a reset during which a level counts as recovering
 
@@ -29,7 +29,7 @@ class Schedule:
 
     def resets(self, step: int) -> bool:
         """Whether 3DGS resets opacities at a step."""
-        return self.refines(step) and step % self.reset_every == 0
+        return self.reset_every > 0 and self.refines(step) and step % self.reset_every == 0
 
 
 def scaled_schedule(config: TrainConfig, refine_stop: int) -> Schedule:
@@ -39,9 +39,11 @@ def scaled_schedule(config: TrainConfig, refine_stop: int) -> Schedule:
     def scaled(step: int) -> int:
         return max(1, round(step * share))
 
-    reset_every = max(scaled(RESET_EVERY), _MIN_RESET_INTERVAL)
+    reset_every = 0
     start, stop = min(config.refine_start, config.max_steps // 5), scaled(refine_stop)
-    if config.lr_schedule == "fast":  # short runs need time to grow too
+    if config.lr_schedule == "published":
+        reset_every = max(scaled(RESET_EVERY), _MIN_RESET_INTERVAL)
+    else:  # short runs need time to grow too
         enough = start + _MIN_REFINEMENTS * config.refine_every
         stop = max(stop, min(enough, int(_LATEST_STOP * config.max_steps)))
     return Schedule(
