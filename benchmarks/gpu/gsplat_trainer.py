@@ -14,6 +14,7 @@ it is.
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -38,7 +39,7 @@ def train(
     cameras: Sequence[Camera],
     photos: Sequence[Tensor],  # float32 [H, W, 3] in [0, 1], on the device
     extent: float,
-    config: TrainConfig,  # of ours: its rates, steps and schedule are used
+    config: TrainConfig,  # of ours: its steps and thresholds are used
     seed: int = 0,
     cap: int = 0,  # Gaussians of 3DGS-MCMC; 0: its default strategy
 ) -> Iterator[tuple[int, Gaussians]]:
@@ -46,7 +47,7 @@ def train(
     import gsplat
     from gsplat.strategy import DefaultStrategy, MCMCStrategy
 
-    device, plan = initial.means.device, schedule_of(config)
+    device, plan = initial.means.device, schedule_of(replace(config, lr_schedule="published"))
     params: dict[str, Any] = {
         name: torch.nn.Parameter(getattr(initial, ours).detach().clone()) for name, ours in NAMES.items()
     }
