@@ -234,7 +234,7 @@ def _steps_as_long(job: Job, config: NestConfig) -> int:
         unordered, job.scene, job.photos, train, few, valid=job.inliers, backend=job.backend,
         movable=np.ones(len(g), bool), shell=job.sky.shell if job.sky else None,
     )  # fmt: skip
-    steps, took = _full_steps(job, (few, 0)), {"nested": list[float](), "full": list[float]()}
+    steps, took = _full_steps(job, few, 0), {"nested": list[float](), "full": list[float]()}
     for _ in range(_TIMED):
         for name, one in (("nested", events), ("full", steps)):
             begin = time.process_time()
@@ -245,16 +245,15 @@ def _steps_as_long(job: Job, config: NestConfig) -> int:
     return max(1, round((config.steps * each["nested"] + sorting) / each["full"]))
 
 
-def train_as_one(job: Job, of: tuple[NestConfig, int]) -> Gaussians:
+def train_as_one(job: Job, config: NestConfig, seed: int) -> Gaussians:
     """The trained model, trained on in full: nesting's rounding, rates and tail average, no levels."""
     g = read_level(job.trained)
-    for after in _full_steps(job, of):
+    for after in _full_steps(job, config, seed):
         g = after
     return g.to("cpu")
 
 
-def _full_steps(job: Job, of: tuple[NestConfig, int]) -> Iterator[Gaussians]:
-    config, seed = of
+def _full_steps(job: Job, config: NestConfig, seed: int) -> Iterator[Gaussians]:
     device = device_of(job.backend)
     state = initial_state(read_level(job.trained).to(device), seed)
     state.sort()

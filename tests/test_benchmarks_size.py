@@ -1,4 +1,4 @@
-"""Ratios at equal SSIM, summaries on made-up curves."""
+"""Ratios at equal SSIM, summaries on made-up curves; all of it on a small capture."""
 
 import json
 import math
@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+from benchmarks.size import Asked, measure
 from benchmarks.size_tables import AS_ONE, OUTSIDE, TRAINED, Measured, ratio, summary
+from sagesplat.demo.capture import make_capture
 from sagesplat.studies.compare.report import MCMC, PLANNED, PRUNED, SAME_SHARE, SNAPSHOTS, Point
 
 
@@ -53,3 +55,15 @@ def test_summary():
         "level 1": 20.0,
         "levels 1 to 4": 20.0,
     }
+
+
+@pytest.mark.slow
+def test_every_kind_of_set_is_measured(tmp_path):
+    make_capture(tmp_path / "yard", views=16, width=64, height=48)
+    asked = Asked(
+        steps=40, nest_steps=10, base_steps=10, as_one_steps=3, tune_steps=2, snapshots=2, shares=(0.5,),
+        caps=(0.5,), plan_views=4,
+    )  # fmt: skip
+    found = measure(tmp_path / "runs", str(tmp_path / "yard"), asked, print)
+    kinds = {point.method for point in found.points}
+    assert kinds >= {AS_ONE, TRAINED, MCMC, PRUNED, SAME_SHARE, SNAPSHOTS, PLANNED}
