@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from benchmarks import size
 from benchmarks.size import Asked, measure
 from benchmarks.size_tables import AS_ONE, OUTSIDE, TRAINED, Measured, ratio, summary
 from sagesplat.demo.capture import make_capture
@@ -58,10 +59,11 @@ def test_summary():
 
 
 @pytest.mark.slow
-def test_every_kind_of_set_is_measured(tmp_path):
+def test_every_kind_of_set_is_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(size, "_TIMED", 10)  # steps that say how many the model tuned as one gets
     make_capture(tmp_path / "yard", views=16, width=64, height=48)
     asked = Asked(
-        steps=40, nest_steps=10, base_steps=10, as_one_steps=3, tune_steps=2, snapshots=2, shares=(0.5,),
+        steps=40, nest_steps=10, base_steps=10, tune_steps=2, snapshots=2, shares=(0.5,),
         caps=(0.5,), plan_views=4,
     )  # fmt: skip
     found = measure(tmp_path / "runs", str(tmp_path / "yard"), asked, print)

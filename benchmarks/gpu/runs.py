@@ -55,7 +55,7 @@ class Run:
 
 
 def full(bench: Bench) -> Outcome:
-    """The whole training at the published pace."""
+    """The whole training, by our schedule."""
     run = run_of(bench, "ours")
     last, views = run.curve[-1], len(bench.scene.train_ids)
     figures = run.figures() | {"views": views, "steps_per_s": run.steps / run.seconds}

@@ -74,7 +74,7 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
         if config.fit == "renders":
             check_nest(job, len(g), g.sh_degree)
         ladder, num_lower = _ladder(job, g, shares, config, checkpoint_key(run, settings, inputs))
-        ladder, label_of = in_cells(ladder, cells_wanted(len(g)) if config.cells == "auto" else config.cells)
+        ladder, label_of = in_cells(ladder, cells_wanted(len(g), config.cells))
         rows, space = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace()
         came_in = [(row, _image(job, g, row, space)) for row in rows]
         precision = None if config.lossless else _precision(job, g, came_in)

@@ -70,7 +70,7 @@ def _cells_of_blocks(job: Job, nest: NestConfig) -> list[int]:
     blocks = [job.run.block(number) for number in range(len(read_blocks(job.run.division)))]
     counts = [sum(read_ladder(block.levels).files[-1].counts.values()) for block in blocks]
     in_all = sum(job.last_level.counts.values())  # blocks overlap
-    wanted = cells_wanted(in_all) if nest.cells == "auto" else nest.cells
+    wanted = cells_wanted(in_all, nest.cells)
     return [round(wanted * count / sum(counts)) for count in counts]
 
 

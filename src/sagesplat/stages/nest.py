@@ -56,7 +56,7 @@ def nest_levels(
             full, job.scene, masks,
             base=base, valid=job.inliers, antialiased=job.antialiased, shell=shell,
         )  # fmt: skip
-        wanted = cells_wanted(len(ordered.gaussians)) if config.cells == "auto" else config.cells
+        wanted = cells_wanted(len(ordered.gaussians), config.cells)
         within = None if inside is None else inside(ordered.gaussians.means.numpy())
         ordered, label_of = nested.in_cells(ordered, wanted, within)
         key = checkpoint_key(run, settings, inputs)

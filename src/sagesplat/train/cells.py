@@ -5,6 +5,7 @@ contracted into a ball of twice its radius (Mip-NeRF 360, Eq. 10).
 """
 
 import warnings
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int16
@@ -17,9 +18,9 @@ _MIDDLE = 0.8  # share of the Gaussians inside the radius from which on coordina
 _SAMPLE = 20_000  # Gaussians of a category that its centres are found from
 
 
-def cells_wanted(count: int) -> int:
-    """Cells of a scene of `count` Gaussians that is split automatically."""
-    return min(MOST, count // _OF_ONE)
+def cells_wanted(count: int, asked: int | Literal["auto"] = "auto") -> int:
+    """Cells of a scene of `count` Gaussians: as asked for, or by their number."""
+    return min(MOST, count // _OF_ONE) if asked == "auto" else asked
 
 
 def split_cells(

@@ -17,8 +17,8 @@ from sagesplat.train.sky import Shell
 from sagesplat.train.state import TrainState
 
 # Thresholds of 3DGS: Gaussians larger than the first fraction of the scene extent are split, smaller ones
-# cloned; fainter ones than `PRUNE_OPACITY` go, after the first opacity reset also those that are larger than
-# the last fraction.
+# cloned; fainter ones than `PRUNE_OPACITY` go, after the first opacity reset (`published` alone has any) also
+# those that are larger than the last fraction.
 _GROW_SCALE, PRUNE_OPACITY, _PRUNE_SCALE = 0.01, 5e-3, 0.1
 _SPLIT_SHRINK = 1.6
 
