@@ -230,6 +230,19 @@ def test_a_promise_is_the_largest_target_whose_needs_are_met():
         np.testing.assert_array_equal((composed >= least)[known], (found >= target - 1e-9)[known])
 
 
+def test_wide_lenses_and_fine_screens_ask_for_more():
+    models, _ = made(0)
+    models = {
+        label: replace(model, calibration=replace(model.calibration, least_support=0.0))
+        for label, model in models.items()
+    }
+    (camera,) = viewpoints(1, 4)
+    wide = replace(camera, width=2 * camera.width, height=2 * camera.height)
+    fine = replace(wide, K=camera.K * np.float32([[2], [2], [1]]))  # the same lens, twice the pixels
+    allowed = 1 - needed(models, expect(models, CELLS, [camera, wide, fine], K), 0.8)
+    np.testing.assert_allclose(allowed[0] / allowed[1:], [[2**0.2] * 2, [2**0.05] * 2])
+
+
 def test_shares_are_those_that_were_seen():
     """Half of what a cell would cover is hidden: the factors know."""
     cameras = viewpoints(60, 6)

@@ -9,10 +9,14 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
     factor_u = (sum_i k_i v_ui + 0.001 v_u) / (sum_i k_i + 0.001)           k_i: by position and direction
                v_ui: true share over `apparent` in view i, what others leave of the cell; v_u: their mean
     mean     = sum_u share_u mean_u,level(u) / sum_u share_u                of the category's composition
-    needed   = threshold + slope * away                                     of a target (`adapt.viewpoint`)
+    needed   = 1 - (1 - threshold - slope * away) / strictness              of a target (`adapt.viewpoint`)
+    strictness = field^0.2 s^0.05                                           of the lens and the screen, over
+                                                                            that of the known views
 
-A target is kept where the mean reaches what is needed. A viewpoint's support is the kernel by position,
-direction and screen to the nearest known view; below `least_support` nothing is promised.
+A target is kept where the mean reaches what is needed. Through wide lenses and on fine screens compositions
+measure less than their means more often, and thresholds are found over all of them: hence the strictness. A
+viewpoint's support is the kernel by position, direction and screen to the nearest known view; below
+`least_support` nothing is promised.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,6 +47,7 @@ from sagesplat.scene.scene import Camera
 LEAST_SHARE = 1e-4  # of a cell in sight: it may be there though it was hidden in all known views
 MOST_FACTOR = 4.0  # of a share over what it would be unhidden
 _PRIOR = 1e-3  # weight of a factor's mean
+_STRICTER = np.array([0.05, 0.2])  # powers of screen and field: docs/developers/promises.md compares them
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +112,13 @@ class Expected:
     distance: Float[np.ndarray, "V C"]  # world units; NaN: out of sight
     support: Float[np.ndarray, "V L"]  # NaN without a model
     away: Float[np.ndarray, " V"]  # 0 at a photo, 1 far from all
+    strictness: Float[np.ndarray, " V"]  # divides the loss that thresholds allow
 
     def at(self, view: int) -> "Expected":
         """What is expected from one of the viewpoints."""
         one = slice(view, view + 1)
-        arrays = {name: getattr(self, name)[one] for name in ("mean", "share", "distance", "support", "away")}
+        of_views = ("mean", "share", "distance", "support", "away", "strictness")
+        arrays = {name: getattr(self, name)[one] for name in of_views}
         return replace(self, **arrays)
 
     @property
@@ -144,11 +151,13 @@ def expect(
     sight = look(cells, cameras)
     shape = len(cameras), len(cells.ids)
     mean, factor = np.full((*shape, levels), np.nan), np.ones(shape)
-    support, away = np.full((len(cameras), len(labels)), np.nan), np.zeros(len(cameras))
+    support = np.full((len(cameras), len(labels)), np.nan)
+    away, strictness = np.zeros(len(cameras)), np.ones(len(cameras))
     place = {cell: i for i, cell in enumerate(cells.ids.tolist())}
     for label, model in models.items():
         known = views_of(cameras, model.extent, model.focal, model.screens)
         away = 1 - matern32(known[:, :6], model.photos.T, PHOTO_LENGTHS).max(1)
+        strictness = strictness_of(known, model.views)
         support[:, np.searchsorted(labels, label)] = matern32(known, model.views, model.lengths[:3]).max(1)
         near = matern32(known[:, :6], model.views[:, :6], PHOTO_LENGTHS)
         for cell in model.cells:
@@ -159,7 +168,7 @@ def expect(
     share = sight.apparent * factor
     share /= np.maximum(share.sum(1, keepdims=True), 1)
     share = np.where(sight.apparent > 0, np.maximum(share, LEAST_SHARE), 0)
-    return Expected(cells.ids, labels, column, mean, share, sight.distance, support, away)
+    return Expected(cells.ids, labels, column, mean, share, sight.distance, support, away, strictness)
 
 
 def views_of(
@@ -170,6 +179,13 @@ def views_of(
     field = np.sqrt([camera.width * camera.height / camera.focal**2 for camera in cameras])
     screen = np.clip(screen, *screens)
     return inputs_of(np.ones(len(cameras)), position, direction, extent, 0.0, screen, field)[:, :-1]
+
+
+def strictness_of(
+    views: Float[np.ndarray, "V 8"], known: Float[np.ndarray, "N 8"]
+) -> Float[np.ndarray, " V"]:
+    """What divides the loss that thresholds allow, of viewpoints (`views_of`); `known`: those of a model."""
+    return np.exp((views[:, 6:] - known[:, 6:].mean(0)) @ _STRICTER)
 
 
 def cell_means(
@@ -215,7 +231,7 @@ def promised(
         if label in models:
             calibration = models[label].calibration
             found[:, column] = calibration.bound(
-                composed[:, [column]], expected.support[:, column], expected.away
+                composed[:, [column]], expected.support[:, column], expected.away, expected.strictness
             )[:, 0]
     return found
 
@@ -229,7 +245,8 @@ def needed(
         if label in models:
             calibration, support = models[label].calibration, expected.support[:, column]
             least = support >= calibration.least_support
-            found[:, column] = np.where(least, calibration.needed(target, expected.away), np.nan)
+            asked = calibration.needed(target, expected.away, expected.strictness)
+            found[:, column] = np.where(least, asked, np.nan)
     return found
 
 

@@ -12,7 +12,8 @@ evaluates the same formulas (`web/src/core/quality.ts`):
     away    = 1 - max_p c(x, photo_p)               by position and direction alone, with PHOTO_LENGTHS; of
                                                     SSIM against photos it is 1 - support
     bound_k = the largest target whose threshold, this far away, mean_k reaches
-              threshold = threshold_target + slope_target * away, at least those of lower targets, at most 1
+              threshold = threshold_target + slope_target * away, at least those of lower targets, at most 1;
+              of fidelity 1 - (1 - that) / strictness, for the lens and screen (`adapt.cell_models`)
 
 `adapt.calibrate` finds, for each target, the threshold: the mean from which on a level keeps the target, at a
 confidence. Between targets it is interpolated. The slopes are for errors that grow away from the photos: what
@@ -76,15 +77,17 @@ class Calibration:
         mean: Float[np.ndarray, "V K"],
         support: Float[np.ndarray, " V"],
         away: Float[np.ndarray, " V"] | None = None,
+        strictness: Float[np.ndarray, " V"] | float = 1.0,
     ) -> Float[np.ndarray, "V K"]:
         """The largest target that each mean keeps; below the first target the same distance from the mean.
 
-        NaN without any target, and where the support is too small. `away`: None: 1 - support.
+        NaN without any target, and where the support is too small. `away`: None: 1 - support. `strictness`
+        divides the loss that thresholds allow.
         """
         away = 1 - support if away is None else away
         if not len(self.targets):
             return np.full(mean.shape, np.nan)
-        needed = self._needed(away)
+        needed = self._needed(away, strictness)
         found = np.array(
             [np.interp(m, n, self.targets) for m, n in zip(mean, needed, strict=True)], np.float64
         ).reshape(mean.shape)
@@ -93,17 +96,25 @@ class Calibration:
         found[support < self.least_support] = np.nan
         return found
 
-    def needed(self, target: float, away: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
+    def needed(
+        self,
+        target: float,
+        away: Float[np.ndarray, " V"],
+        strictness: Float[np.ndarray, " V"] | float = 1.0,
+    ) -> Float[np.ndarray, " V"]:
         """The mean from which on a target is kept, this far away; between targets it is interpolated."""
         if not len(self.targets):
             return np.full(len(away), np.nan)
-        known = self._needed(away)
+        known = self._needed(away, strictness)
         found = np.array([np.interp(target, self.targets, row) for row in known])
         return np.where(target < self.targets[0], known[:, 0] - (self.targets[0] - target), found)
 
-    def _needed(self, away: Float[np.ndarray, " V"]) -> Float[np.ndarray, "V G"]:
+    def _needed(
+        self, away: Float[np.ndarray, " V"], strictness: Float[np.ndarray, " V"] | float
+    ) -> Float[np.ndarray, "V G"]:
         """The mean that each of the targets needs."""
-        return np.minimum(np.maximum.accumulate(self.thresholds + np.outer(away, self.slopes), 1), 1)
+        found = np.minimum(np.maximum.accumulate(self.thresholds + np.outer(away, self.slopes), 1), 1)
+        return 1 - (1 - found) / np.reshape(strictness, (-1, 1))
 
 
 NO_CALIBRATION = Calibration("uncalibrated", 0.95, 0, np.zeros(0), np.zeros(0), np.zeros(0), 0.0)

@@ -88,6 +88,7 @@ const HALF_WEIGHT = 1e-3;
 
 const COLUMNS = 8; // of the shared views: position over the extent, direction, log screen, log field
 const PHOTO_COLUMNS = 6; // of the photos: position and direction
+const [STRICTER_SCREEN, STRICTER_FIELD] = [0.05, 0.2] as const; // powers of screen and field
 const PLACE_LENGTHS = [0.3, 0.5] as const; // of position and direction, for photos and factors
 
 /** The views that the models of all labels share, and how far they are from the current viewpoint. */
@@ -98,6 +99,8 @@ export class Views {
   readonly alike: Float64Array; // [V] of place: 1 at the view
   readonly rows: Float64Array; // [V, COLUMNS]
   private readonly photos: Float64Array; // [P, PHOTO_COLUMNS]
+  strictness = 1; // of screen and lens: divides the loss that thresholds allow
+  private readonly usual: number; // log of the strictness, mean over the views
   fromPhotos = Number.NaN; // of the current viewpoint: 0 at a photo, 1 far from all; NaN: none are known
 
   constructor(
@@ -110,6 +113,10 @@ export class Views {
     this.turned = new Float64Array(count);
     this.rescaled = new Float64Array(count);
     this.alike = new Float64Array(count);
+    const mean = (column: number) =>
+      this.rows.reduce((sum, value, at) => (at % COLUMNS === column ? sum + value : sum), 0) /
+      Math.max(count, 1);
+    this.usual = STRICTER_SCREEN * mean(6) + STRICTER_FIELD * mean(7);
   }
 
   /** Computes the differences from a viewpoint, once for all labels. */
@@ -121,6 +128,7 @@ export class Views {
     const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), smallest), largest));
     // SSIM is known in the photos' pictures alone
     const field = sent.quality === "ssim" ? 0 : Math.log(fieldOf(viewpoint));
+    this.strictness = Math.exp(STRICTER_SCREEN * screen + STRICTER_FIELD * field - this.usual);
     const [position, direction] = PLACE_LENGTHS;
     for (let i = 0, at = 0; i < this.away.length; i++, at += COLUMNS) {
       const away = square(x, y, z, rows, at);
@@ -345,7 +353,7 @@ export class LabelModel {
     let least = -Infinity;
     return this.thresholds.map((threshold, g) => {
       least = Math.max(least, threshold + (this.slopes[g] as number) * away);
-      return Math.min(least, 1);
+      return 1 - (1 - Math.min(least, 1)) / this.views.strictness;
     });
   }
 }
