@@ -97,7 +97,7 @@ def test_the_recipe_trains_and_densifies(tmp_path, monkeypatch):
     cameras = [scene.views[row].camera for row in scene.train_ids]
     initial = from_points(scene.points, np.full(len(scene.points.xyz), -1, np.int16), 3)
     config = TrainConfig(
-        max_steps=120, level_every=40, refine_start=20, refine_stop=30_000, refine_every=20, grow_grad=1e-6
+        max_steps=120, level_every=40, refine_stop=30_000, refine_every=20, grow_grad=1e-6
     )  # fmt: skip
 
     def error(g) -> float:

@@ -37,7 +37,7 @@ from sagesplat.train.trainer import train
 
 CPU = torch.device("cpu")
 # densification from step 24 to 60 every 6, resets at 40, the SH degree rises every 4 steps
-CONFIG = TrainConfig(max_steps=120, level_every=10, refine_start=24, refine_every=6, lr_schedule="published")
+CONFIG = TrainConfig(max_steps=120, level_every=10, refine_every=6, lr_schedule="published")
 
 
 @pytest.fixture(autouse=True)

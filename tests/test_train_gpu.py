@@ -33,7 +33,7 @@ from sagesplat.train.trainer import train
 
 CPU = torch.device("cpu")
 # a reset after step 9
-SHORT = replace(BUSY, max_steps=26, level_every=12, refine_every=4, refine_start=4)
+SHORT = replace(BUSY, max_steps=26, level_every=12, refine_every=4)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -17,7 +17,7 @@ from sagesplat.train.events import LabelFrozen, LevelSaved, Resumed, Step, Train
 from sagesplat.train.parallel import train_together
 from sagesplat.train.trainer import train
 
-SHORT = replace(CONFIG, max_steps=40, level_every=10, refine_start=8, refine_every=6)
+SHORT = replace(CONFIG, max_steps=40, level_every=10, refine_every=6)
 
 
 def run(events):

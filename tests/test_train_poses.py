@@ -159,7 +159,7 @@ def test_a_photo_of_something_else_leaves_the_pose(scene):
 
 def test_training_mends_poses(scene):
     off = with_noise(scene)
-    config = TrainConfig(max_steps=300, level_every=300, sh_degree=0, poses=True, refine_start=10**6)
+    config = TrainConfig(max_steps=300, level_every=300, sh_degree=0, poses=True)
     labels, xyz = np.full(len(scene.points.xyz), -1, np.int16), TRUTH.means.numpy()
     trained = list(train(off, Photos(off.views), labels, config))[-1]
     assert isinstance(trained, Trained)

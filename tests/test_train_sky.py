@@ -165,7 +165,6 @@ def test_training_keeps_the_sky_on_the_shell(capture, tmp_path, strategy):
         max_steps=12,
         level_every=6,
         refine_every=3,
-        refine_start=1,
         strategy=strategy,
         grow_grad=1e-9,
         sh_degree=1,

@@ -19,8 +19,8 @@ from sagesplat.train.state import TrainState, initial_state
 from sagesplat.train.strategy import STRATEGIES, Densification, make_strategy, schedule_of
 from sagesplat.train.trainer import train
 
-# densification from step 10 to 150, every 10 steps
-CONFIG = TrainConfig(max_steps=300, refine_start=10, refine_every=10, lr_schedule="published", grow_grad=0)
+# densification from step 60 to 150, every 10 steps
+CONFIG = TrainConfig(max_steps=300, refine_every=10, lr_schedule="published", grow_grad=0)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def made(scene: Scene, name: str, **options: Any) -> Densification:
 
 @pytest.mark.parametrize("name", STRATEGIES)
 @pytest.mark.parametrize(
-    ("step", "refines"), [(10, False), (15, False), (20, True), (140, True), (290, False)]
+    ("step", "refines"), [(60, False), (65, False), (70, True), (140, True), (290, False)]
 )
 def test_refinement_follows_the_schedule(scene: Scene, name: str, step: int, refines: bool) -> None:
     state = state_at(step)
@@ -77,7 +77,6 @@ def test_opacities_are_reset_for_categories_that_still_train(
     monkeypatch.setattr(schedule, "_MIN_RESET_INTERVAL", 40)
     strategy = made(scene, "default", refine_stop=30_000, refine_every=1000)
     assert [step for step in range(300) if strategy.schedule.resets(step)] == [
-        40,
         80,
         120,
         160,
@@ -85,7 +84,7 @@ def test_opacities_are_reset_for_categories_that_still_train(
         240,
         280,
     ]
-    state = state_at(40)
+    state = state_at(80)
     state.frozen = {3: 7}
     frozen = state.gaussians.label_ids == 3
     before = state.gaussians.logit_opacities.clone()
@@ -93,7 +92,7 @@ def test_opacities_are_reset_for_categories_that_still_train(
     after = state.gaussians.logit_opacities
     assert torch.equal(after[frozen], before[frozen])
     assert after[~frozen].sigmoid().max() <= 0.0101
-    assert state.last_reset == 40
+    assert state.last_reset == 80
 
 
 def test_mcmc_regularises_and_adds_noise(scene: Scene) -> None:
@@ -125,7 +124,7 @@ def test_a_new_strategy_is_one_entry(scene: Scene, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(
         "sagesplat.train.trainer.check_limits", lambda *_: None
     )  # knows the names of the package
-    config: Any = replace(CONFIG, max_steps=40, level_every=15, refine_start=8, refine_stop=24_000)
+    config: Any = replace(CONFIG, max_steps=40, level_every=15, refine_stop=24_000)
     config = replace(config, strategy="halving")  # type: ignore[arg-type]
     assert schedule_of(config).refine_stop == 32
     labels = torch.full((40,), 3).numpy()

@@ -44,7 +44,6 @@ def frozen_kept(bench: Bench, steps: int) -> dict[str, Any]:
         max_steps=steps,
         lr_schedule="published",
         refine_every=every,
-        refine_start=1,
         refine_stop=60_000,
         grow_grad=0,
     )  # fmt: skip

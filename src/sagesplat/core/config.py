@@ -148,8 +148,6 @@ class TrainConfig:
     3DGS-MCMC, from 15,000 steps on with its regularisation."""
     refine_every: PositiveInt31 = 100
     """Steps between two densifications, not scaled: the gradient statistics need the views."""
-    refine_start: Int31 = 500
-    """First step of densification, not scaled, at most a fifth of the training."""
     refine_stop: Int31 = 15_000
     """Last step of densification."""
     grow_grad: NotNegative = 2e-4

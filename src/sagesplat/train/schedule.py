@@ -8,6 +8,7 @@ from sagesplat.core.config import TrainConfig
 _REFERENCE_STEPS = 30_000
 # Steps between two opacity resets, and between two increases of the SH degree (Kerbl et al. 2023).
 RESET_EVERY, RAISE_SH_EVERY = 3000, 1000
+_REFINE_START = 500  # not scaled, as refinements are not: the gradient statistics need the views
 _MIN_REFINEMENTS, _LATEST_STOP = 8, 0.7  # refinements of a short fast run; share of the run
 _MIN_RESET_INTERVAL = 1500  # steps that a model needs between two resets, however short the run
 
@@ -40,7 +41,7 @@ def scaled_schedule(config: TrainConfig, refine_stop: int) -> Schedule:
         return max(1, round(step * share))
 
     reset_every = 0
-    start, stop = min(config.refine_start, config.max_steps // 5), scaled(refine_stop)
+    start, stop = min(_REFINE_START, config.max_steps // 5), scaled(refine_stop)
     if config.lr_schedule == "published":
         reset_every = max(scaled(RESET_EVERY), _MIN_RESET_INTERVAL)
     else:  # short runs need time to grow too
