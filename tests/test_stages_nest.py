@@ -63,7 +63,7 @@ def test_sizes_are_geometric() -> None:
 
 def test_everything_is_drawn_more_often_in_the_end() -> None:
     config, rng = NestConfig(), np.random.default_rng(0)
-    for done, share in ((0.0, 0.1), (0.5, 0.5), (1.0, 0.9)):
+    for done, share in ((0.0, 0.1), (0.5, 0.425), (1.0, 0.75)):
         drawn = np.stack([draw_shares(rng, np.arange(3), config, done) for _ in range(2000)])
         assert (drawn == 1).all(1).mean() == pytest.approx(0.8 * share, abs=0.04)
         assert ((drawn >= 0.4).all(1) & (drawn < 1).all(1)).mean() > 0.15 * share

@@ -1,5 +1,6 @@
 """Nested levels (prefix LOD): a category is one ordered set of Gaussians, its prefixes are its levels."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,9 +37,10 @@ from sagesplat.train.trainer import LOOK_EVERY, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
 
 # docs/developers/nested.md compares these
-_LR_MULTIPLIER, _SHRINK_TO = 4.0, 0.05  # of 3DGS's late learning rates: at first, and what is left of it
+_LR_MULTIPLIER, _SHRINK_TO = 4.0, 0.3  # of 3DGS's late learning rates: at first, and what is left of it
+_USUAL_STEPS, _MOST_MULTIPLIER = 2400, 8.0  # fewer steps have a larger one, by the root
 _DRAWN_FROM = 0.03  # smallest prefix that a step draws; less favours categories that are easy to represent
-_FULL_SHARE, _FULL_SHARE_END = 0.1, 0.9  # of the first and of the last steps draw the full model
+_FULL_SHARE, _FULL_SHARE_END = 0.1, 0.75  # of the first and of the last steps draw the full model
 _SHORT, _FULL_SHARE_SHORT = 1000, 0.3  # of fewer steps the first share is this: else the full model suffers
 _BY_CELL = 0.5  # of the steps draw a prefix for each cell, not for each category
 _SAVE_EVERY = 500
@@ -213,7 +215,7 @@ def nest(
     """Train a nested ladder: afterwards every composition of prefixes renders well.
 
     Each step draws a prefix of every category, log-uniform between 3 % and all of it, or the full model (with
-    a probability that rises from 0.1, in short trainings 0.3, to 0.9; a fifth of these steps draw prefixes
+    a probability that rises from 0.1, in short trainings 0.3, to 0.75; a fifth of these steps draw prefixes
     between 40 and 100 %). In half of the steps each cell has a prefix of its own instead. The composition is
     compared with a photo. Values are rounded as the increments will hold them. The result is the
     mean of the last steps' values (at most 500 steps, or a fifth): prefixes pull in different directions to
@@ -422,8 +424,10 @@ def learning_rates(
         replace(train_config, max_steps=3, lr_schedule="published"), scene.extent
     ).learning_rates(2)
 
+    first = min(_LR_MULTIPLIER * math.sqrt(_USUAL_STEPS / max(config.steps, 1)), _MOST_MULTIPLIER)
+
     def rates(step: int) -> Mapping[str, float]:
-        multiplier = _LR_MULTIPLIER * _SHRINK_TO ** (step / config.steps)
+        multiplier = first * _SHRINK_TO ** (step / config.steps)
         return {name: multiplier * rate for name, rate in third.items()}
 
     return rates
