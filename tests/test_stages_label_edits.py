@@ -193,11 +193,11 @@ def test_parts_are_measured_as_everything_is(run: Path, viewer: Path) -> None:
         # at level 3 the left car is complete, so that it has the opacities of the full model there
         exact = told.level != 3
         np.testing.assert_allclose(one[exact], other[exact], atol=tolerance)  # back within float32
-        np.testing.assert_allclose(one, other, atol=200 * tolerance)
+        np.testing.assert_allclose(one, other, atol=150 * tolerance)
     drawn, told = viewpoints_of(job), sampled_of(job)
     measured = measured_levels(job, [drawn.cameras[row] for row in drawn.rows("fit")])
     np.testing.assert_allclose(np.delete(told.whole, 2, -1), np.delete(measured.whole, 2, -1), atol=1e-4)
-    np.testing.assert_allclose(told.whole, measured.whole, atol=0.06)
+    np.testing.assert_allclose(told.whole, measured.whole, atol=0.04)
     parts = np.isin(job.cells.labels, [3, 201])
     np.testing.assert_array_equal(told.pixels[:, parts], measured.pixels[:, parts])
     np.testing.assert_array_equal(told.fidelity[:, parts], measured.fidelity[:, parts])

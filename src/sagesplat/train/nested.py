@@ -37,8 +37,8 @@ from sagesplat.train.trainer import LOOK_EVERY, finite, named_failures, train
 from sagesplat.train.votes import label_weights, winners
 
 # docs/developers/nested.md compares these
-_LR_MULTIPLIER, _SHRINK_TO = 4.0, 0.3  # of 3DGS's late learning rates: at first, and what is left of it
-_USUAL_STEPS, _MOST_MULTIPLIER = 2400, 8.0  # fewer steps have a larger one, by the root
+_LR_MULTIPLIER, _SHRINK_TO = 4.0, 0.1  # of 3DGS's late learning rates: at first, and what is left of it
+_USUAL_STEPS, _MOST_MULTIPLIER = 2400, 6.0  # fewer steps have a larger one, by the root
 _DRAWN_FROM = 0.03  # smallest prefix that a step draws; less favours categories that are easy to represent
 _FULL_SHARE, _FULL_SHARE_END = 0.1, 0.75  # of the first and of the last steps draw the full model
 _SHORT, _FULL_SHARE_SHORT = 1000, 0.3  # of fewer steps the first share is this: else the full model suffers
