@@ -238,7 +238,7 @@ def test_wide_lenses_and_fine_screens_ask_for_more():
     }
     (camera,) = viewpoints(1, 4)
     wide = replace(camera, width=2 * camera.width, height=2 * camera.height)
-    fine = replace(wide, K=camera.K * np.array([[2], [2], [1]], np.float32))  # the same lens, twice the pixels
+    fine = replace(wide, K=camera.K * np.array([[2], [2], [1]], np.float32))  # the same lens
     allowed = 1 - needed(models, expect(models, CELLS, [camera, wide, fine], K), 0.8)
     np.testing.assert_allclose(allowed[0] / allowed[1:], [[2**0.2] * 2, [2**0.05] * 2])
 
