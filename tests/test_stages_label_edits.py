@@ -181,7 +181,7 @@ def test_a_split_is_exact(run: Path, viewer: Path) -> None:
 
 def test_parts_are_measured_as_everything_is(run: Path, viewer: Path) -> None:
     """Only parts of images are rendered for them; the rest is taken from the run."""
-    made = edited(run, viewer, Split(CAR, "left car", {CAR: ((0, 40),)}))
+    made = edited(run, viewer, Split(CAR, "left car", {CAR: ((20, 30),)}))
     job, config = job_of(made.path), FitConfig()
     told, measured = by_key(observations_of(job)), by_key(observed_views(job, config))
     for name in ("label_id", "level", "view", "num_pixels", "distance"):
@@ -193,11 +193,11 @@ def test_parts_are_measured_as_everything_is(run: Path, viewer: Path) -> None:
         # at level 3 the left car is complete, so that it has the opacities of the full model there
         exact = told.level != 3
         np.testing.assert_allclose(one[exact], other[exact], atol=tolerance)  # back within float32
-        np.testing.assert_allclose(one, other, atol=150 * tolerance)
+        np.testing.assert_allclose(one, other, atol=60 * tolerance)
     drawn, told = viewpoints_of(job), sampled_of(job)
     measured = measured_levels(job, [drawn.cameras[row] for row in drawn.rows("fit")])
     np.testing.assert_allclose(np.delete(told.whole, 2, -1), np.delete(measured.whole, 2, -1), atol=1e-4)
-    np.testing.assert_allclose(told.whole, measured.whole, atol=0.04)
+    np.testing.assert_allclose(told.whole, measured.whole, atol=0.02)
     parts = np.isin(job.cells.labels, [3, 201])
     np.testing.assert_array_equal(told.pixels[:, parts], measured.pixels[:, parts])
     np.testing.assert_array_equal(told.fidelity[:, parts], measured.fidelity[:, parts])

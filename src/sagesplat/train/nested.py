@@ -38,7 +38,7 @@ from sagesplat.train.votes import label_weights, winners
 
 # docs/developers/nested.md compares these
 _LR_MULTIPLIER, _SHRINK_TO = 4.0, 0.1  # of 3DGS's late learning rates: at first, and what is left of it
-_USUAL_STEPS, _MOST_MULTIPLIER = 2400, 6.0  # fewer steps have a larger one, by the root
+_REFERENCE_STEPS, _MOST_MULTIPLIER = 2400, 6.0  # the first goes with the root of these over the steps
 _DRAWN_FROM = 0.03  # smallest prefix that a step draws; less favours categories that are easy to represent
 _FULL_SHARE, _FULL_SHARE_END = 0.1, 0.75  # of the first and of the last steps draw the full model
 _SHORT, _FULL_SHARE_SHORT = 1000, 0.3  # of fewer steps the first share is this: else the full model suffers
@@ -423,8 +423,7 @@ def learning_rates(
     third = LrSchedule(
         replace(train_config, max_steps=3, lr_schedule="published"), scene.extent
     ).learning_rates(2)
-
-    first = min(_LR_MULTIPLIER * math.sqrt(_USUAL_STEPS / max(config.steps, 1)), _MOST_MULTIPLIER)
+    first = min(_LR_MULTIPLIER * math.sqrt(_REFERENCE_STEPS / max(config.steps, 1)), _MOST_MULTIPLIER)
 
     def rates(step: int) -> Mapping[str, float]:
         multiplier = first * _SHRINK_TO ** (step / config.steps)

@@ -165,9 +165,9 @@ def _changes(
     )
     away = np.abs(after.away - before.away)[:, None] * steepest
     for levels in tried:
-        known = before.of_composition(levels)
-        loss, told = ((1 - e.of_composition(levels)) * e.strictness[:, None] for e in (before, after))
-        change = (np.abs(told - loss) + away) / allowed_change(known)
+        known, told = before.of_composition(levels), after.of_composition(levels)
+        losses = (1 - known) * before.strictness[:, None], (1 - told) * after.strictness[:, None]
+        change = (np.abs(losses[1] - losses[0]) + away) / allowed_change(known)
         worst = np.maximum(worst, np.nan_to_num(change).max(0, initial=0.0))
     return dict(zip(before.labels.tolist(), worst.tolist(), strict=True))
 
