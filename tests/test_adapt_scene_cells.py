@@ -4,9 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sagesplat.adapt.bound_plans import Costs
-from sagesplat.adapt.scene_cells import thinned
+from sagesplat.adapt.plan import Choice, Plan
+from sagesplat.adapt.scene_cells import Search, thinned
 from sagesplat.adapt.scene_plans import measured_in_composition, plan_for_scene
 
 VIEWS, CELLS, LEVELS = 40, 6, 5
@@ -89,15 +92,67 @@ def test_what_cannot_be_asked_for_stays() -> None:
     assert plan.cells == equal.levels_of_cells(LABEL_OF)
 
 
-def test_what_a_composition_misses_is_said() -> None:
+def test_by_how_much_a_composition_exceeds_its_target_is_said() -> None:
     measured, pixels = _measured(2)
     of_label = np.stack([_whole(measured, pixels, np.full(5, k)) for k in range(LEVELS)], 1)
     both = np.stack([of_label, measured[:, 5]], 1)
     equal = plan_for_scene(both, np.zeros((VIEWS, 2)), _costs().by_label(LABEL_OF), 0.8, 0.95, "fidelity")
-    plan, missed = measured_in_composition(equal, np.tile([0.75, 0.9], (30, 1)))
-    assert missed == {3: pytest.approx(0.05)}
+    plan, over = measured_in_composition(equal, np.tile([0.75, 0.9], (30, 1)))
+    assert over == {3: pytest.approx(-0.05), 7: pytest.approx(0.1)}
     assert [choice.calibrated for choice in plan.choices] == [False, True]
     assert plan.levels == equal.levels
     one = np.where(np.arange(20) == 3, 0.79, 0.85)[:, None] * np.ones(2)  # in 20 viewpoints, 19 of 20
-    assert measured_in_composition(equal, one)[1] == {}
-    assert measured_in_composition(equal, one, proven=False)[1] == dict.fromkeys((3, 7), pytest.approx(0.01))
+    assert measured_in_composition(equal, one)[1] == dict.fromkeys((3, 7), pytest.approx(0.05))
+    least = measured_in_composition(equal, one, proven=False)[1]
+    assert least == dict.fromkeys((3, 7), pytest.approx(-0.01))
+
+
+def _searched(response, target: float, rounds: int = 9, settling: int = 5) -> list[tuple[list, list]]:
+    """What a search asks for in each round, and by how much categories are over the target by `response`.
+
+    `response` takes what is asked, and gives the bytes of categories (1: all) and what they measure.
+    """
+    choices = tuple(Choice(label, 1, target, math.nan, 1, "ok") for label in range(3))
+    most = np.ones((3, 1), int)
+    search, tried = Search(Plan(target, None, choices, 0.95), Costs((0, 1, 2), most, most, most)), []
+    for left in reversed(range(rounds)):
+        asked = [search.asked[label] for label in range(3)]
+        sent, measured = response(np.array(asked))
+        over = [got - target for got in measured]
+        tried.append((asked, over))
+        choices = tuple(Choice(i, 1, target, math.nan, 1, "ok", sent[i]) for i in range(3))
+        plan = Plan(target, None, choices, 0.95)
+        if not search.narrow(plan, dict(enumerate(over)), settle=left <= settling):
+            break
+    return tried
+
+
+@given(
+    st.tuples(*[st.floats(-0.06, 0.06)] * 3),
+    st.tuples(*[st.sampled_from([1e-4, 0.003, 0.012])] * 3),
+    st.floats(0, 0.2),
+    st.sampled_from([0.8, 0.9]),
+)
+def test_a_search_ends_close_to_its_target(error, step, spill, target) -> None:
+    """Whatever compositions measure above or below what is asked, in steps of levels, beside neighbours."""
+
+    def response(asked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        levels = np.ceil(asked / step) * step
+        return np.zeros(3, int), np.minimum(levels + np.array(error) + spill * (levels.mean() - target), 1)
+
+    tried = _searched(response, target)
+    assert tried[0][0] == [target] * 3
+    held = [over for _, over in tried if min(over) >= 0]
+    assert held
+    assert max(min(held, key=sum)) < 0.03 + 0.012
+
+
+def test_neighbours_are_asked_for_more_where_a_category_has_all_it_can_get() -> None:
+    def response(asked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The first lies below the target until the second has 0.93."""
+        first = 0.85 + 0.1 * (asked[1] >= 0.93)
+        return (asked >= [0.92, 2, 2]).astype(int), np.array([first, *asked[1:]])
+
+    asked, over = _searched(response, 0.9)[-1]
+    assert min(over) >= 0
+    assert asked[1] >= 0.93

@@ -18,7 +18,50 @@ from jaxtyping import Float, Int
 from sagesplat.adapt.bound_plans import Costs
 from sagesplat.adapt.plan import Plan
 
+_CLOSE = 0.004  # fidelity asked for, between what is enough and what is not
+_FURTHER = 1.2  # times what is missed
 _PRIOR = 1e-3  # of a gain where the target is kept already, beside one where it is missed
+
+
+class Search:
+    """What to ask of each category so that what it measures in the composition is just the plan's target."""
+
+    def __init__(self, plan: Plan, costs: Costs) -> None:
+        """`costs`: of categories."""
+        self._most = dict(zip(costs.labels, costs.transfer_bytes[:, -1].tolist(), strict=True))
+        self.asked = {choice.label_id: plan.target for choice in plan.choices if choice.status == "ok"}
+        self._too_little = dict[int, float]()  # by category, the most that was
+        self._enough = dict[int, float]()  # the least that was
+
+    def narrow(self, plan: Plan, over: Mapping[int, float], *, settle: bool) -> bool:
+        """Ask for something else by how much a plan's categories exceed the target; False: nothing is left.
+
+        `settle`: ask for what was enough. A category that misses the target with all it can get lies beside
+        others that spill over it: these count as missing as much.
+        """
+        before, sent = dict(self.asked), {choice.label_id: choice.transfer_bytes for choice in plan.choices}
+        spilt = max((-by for label, by in over.items() if sent[label] == self._most[label]), default=0.0)
+        for label, by in over.items():
+            self.asked[label] = self._next(label, min(by, -spilt) if spilt > 0 else by, settle)
+        return self.asked != before
+
+    def _next(self, label: int, by: float, settle: bool) -> float:
+        asked = self.asked[label]
+        # what was found beside other neighbours may no longer be so
+        if by >= 0:
+            self._enough[label] = asked
+            if self._too_little.get(label, -np.inf) >= asked:
+                del self._too_little[label]
+        else:
+            self._too_little[label] = asked
+            if self._enough.get(label, np.inf) <= asked:
+                del self._enough[label]
+        enough, too_little = self._enough.get(label), self._too_little.get(label)
+        if enough is None:
+            return min(asked - _FURTHER * by + settle * _CLOSE, 1.0)
+        if settle or (too_little is not None and enough - too_little < _CLOSE):
+            return enough
+        return asked - by if too_little is None else (enough + too_little) / 2
 
 
 def thinned(

@@ -106,10 +106,10 @@ def raise_failing_levels(
     Returns:
         The plan, and whether its levels are still the same.
     """
-    plan, missed = measured_in_composition(plan, measured)
+    plan, over = measured_in_composition(plan, measured)
     levels = np.array([choice.level - 1 for choice in plan.choices])
     top = costs.count.shape[1] - 1
-    up = np.array([choice.label_id in missed for choice in plan.choices], bool)
+    up = np.array([over.get(choice.label_id, 0.0) < 0 for choice in plan.choices], bool)
     if (levels[up] == top).any():  # what is at its top already misses by its neighbours
         up[:] = True
     raised = np.where(up & (levels < top), levels + 1, levels)
@@ -122,13 +122,13 @@ def raise_failing_levels(
 def measured_in_composition(
     plan: Plan, measured: Float[np.ndarray, "V L"], *, proven: bool = True
 ) -> tuple[Plan, dict[int, float]]:
-    """A plan of a scene with what its composition measures, and by how much categories miss the target.
+    """A plan of a scene with what its composition measures, and by how much categories exceed the target.
 
     `measured` is that of `raise_failing_levels`. Of a plan that nothing else has `proven` for new viewpoints,
     as many must keep the target as split conformal prediction asks for.
     """
     assert plan.share is not None
-    choices, missed = [], dict[int, float]()
+    choices, over = [], dict[int, float]()
     for i, choice in enumerate(plan.choices):
         values = measured[np.isfinite(measured[:, i]), i]
         if choice.status == "ok" and plan.share < 1 and len(values) >= fewest_views(plan.share):
@@ -136,10 +136,9 @@ def measured_in_composition(
             least = float(np.sort(values)[len(values) - needed])
             here = reached(values >= plan.target)
             choice = replace(choice, predicted=least, reached=here, calibrated=least >= plan.target)
-            if least < plan.target:
-                missed[choice.label_id] = plan.target - least
+            over[choice.label_id] = least - plan.target
         choices.append(choice)
-    return replace(plan, choices=tuple(choices)), missed
+    return replace(plan, choices=tuple(choices)), over
 
 
 def never_dearer(plans: Sequence[Plan]) -> list[Plan]:

@@ -25,7 +25,7 @@ from sagesplat.adapt.coverage import Decisions, score
 from sagesplat.adapt.fidelity import shown_enough
 from sagesplat.adapt.observe import LabelImages, Observations
 from sagesplat.adapt.plan import Plan
-from sagesplat.adapt.scene_cells import thinned
+from sagesplat.adapt.scene_cells import Search, thinned
 from sagesplat.adapt.scene_plans import (
     measured_in_composition,
     never_dearer,
@@ -57,6 +57,8 @@ from sagesplat.stages.viewpoints import fit_viewpoints
 _RAISES = 6  # times that a plan is measured in its composition, and its failing levels raised
 # at so many viewpoints at most: dinosaur's plans take 18 s (with all 194 38 s, and 0 to 3 % more bytes)
 _VIEWPOINTS = 128
+_ROUNDS = 9  # of a search for plans by cell; from so many before its end, what was enough is asked for
+_SETTLING = 5
 
 
 class NestedLevels(Method):
@@ -243,10 +245,9 @@ class NestedLevels(Method):
         return never_dearer(plans)
 
     def _thinned(self, plans: Sequence[Plan], share: float, cameras: Sequence[Camera]) -> dict[int, Plan]:
-        """Plans for fidelity by cell, by their place: those that hold in their compositions at `cameras`.
+        """Plans for fidelity by cell, by their place: the cheapest that hold as composed, at `cameras`.
 
-        A category that misses its target there is asked for more, by what it misses, in each round by half as
-        much again. Where that changes nothing its neighbours spill over it: they are asked for half of it.
+        What to ask of each category is searched (`scene_cells.Search`), of all at once.
         """
         job, found, label_of = self.job, dict[int, Plan](), self.job.cells.label_of
         if len(self.cell_costs.labels) == len(self.costs.labels) or len(cameras) < fewest_views(share):
@@ -255,32 +256,26 @@ class NestedLevels(Method):
         shown = sampled.by_label(label_of).shown()
         counted = shown[:, np.unique(job.cells.labels, return_inverse=True)[1]]
         pixels = np.where(counted, sampled.pixels, 0.0)
-        reaching = {
-            i: {c.label_id: plan.target for c in plan.choices if c.status == "ok"}
+        searches = {
+            i: Search(plan, self.costs)
             for i, plan in enumerate(plans)
             if plan.quality == "fidelity" and share < 1
         }
-        before = dict[int, dict[int, int]]()
-        for again in range(_RAISES):
+        for left in reversed(range(_ROUNDS)):
             tried = {
-                i: thinned(plans[i], sampled.fidelity, pixels, self.cell_costs, label_of, asked)
-                for i, asked in reaching.items()
+                i: thinned(plans[i], sampled.fidelity, pixels, self.cell_costs, label_of, search.asked)
+                for i, search in searches.items()
             }
             if not tried:
                 break
             measured = self._in_composition(list(tried.values()), cameras)
             for j, (i, plan) in enumerate(tried.items()):
-                plan, missed = measured_in_composition(plan, measured[:, j], proven=False)
-                if not missed:
+                plan, over = measured_in_composition(plan, measured[:, j], proven=False)
+                held = min(over.values(), default=0.0) >= 0
+                if held and (i not in found or (plan.transfer_bytes or 0) < (found[i].transfer_bytes or 0)):
                     found[i] = plan
-                    del reaching[i]
-                    continue
-                levels = plan.levels_of_cells(label_of)
-                changed = {label_of[cell] for cell in label_of if levels[cell] != before.get(i, {}).get(cell)}
-                before[i] = levels
-                spilt = max((by for label, by in missed.items() if label not in changed), default=0.0)
-                for label in reaching[i]:
-                    reaching[i][label] += missed.get(label, spilt / 2) * 1.5**again
+                if not searches[i].narrow(plan, over, settle=left <= _SETTLING):
+                    del searches[i]
         return found
 
     def _in_composition(self, plans: Sequence[Plan], cameras: Sequence[Camera]) -> np.ndarray:
