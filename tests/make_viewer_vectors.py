@@ -153,9 +153,15 @@ def model(seed: int, views: int, levels: list[int], *, unseen: bool = True) -> V
 
 
 def fidelity_models(
-    cells: Cells, cameras: Sequence[Camera], levels: int, seed: int
+    cells: Cells, cameras: Sequence[Camera], levels: int, seed: int, last: float = 1.0
 ) -> dict[int, FidelityModel]:
-    """A model of fidelity for each category; every third cell has no views, and every fourth few factors."""
+    """A model of fidelity for each category; every third cell has no views, and every fourth few factors.
+
+    `last`: of the last level; below 1 as of an adopted splat, which keeps targets up to that less 0.01.
+    """
+    known = replace(calibration("fidelity"), least_support=0.05)
+    if last < 1:
+        known = replace(known, targets=np.append(known.targets[:-1], last - 0.01))
     rng, found = np.random.default_rng(seed), {}
     views = views_of(cameras, EXTENT, FOCAL, SCREENS)
     for label in np.unique(cells.labels).tolist():
@@ -164,7 +170,7 @@ def fidelity_models(
             rows = np.flatnonzero(rng.uniform(size=len(views)) < (0.0 if cell % 3 == 2 else 0.7))
             factors = np.where(rng.uniform(size=len(views)) < (0.9 if i % 4 == 3 else 0.3), -1.0, 0.0)
             factors = np.where(factors < 0, factors, rng.uniform(0, 1.5, len(views)))
-            offsets = np.append(np.sort(rng.uniform(0.6, 0.98, levels - 1)), 1.0)
+            offsets = np.append(np.sort(rng.uniform(0.6, last - 0.02, levels - 1)), last)
             weights = rng.normal(0, 0.03, (levels, len(rows))) * (np.arange(levels) < levels - 1)[:, None]
             logs = rng.normal(0.8, 0.4, len(rows))
             made.append(CellModel(cell, offsets, rows, logs, 0.7, weights, factors))
@@ -178,7 +184,7 @@ def fidelity_models(
             photos=_photos(seed, 5),
             cells=tuple(made),
             rmse=0.03,
-            calibration=replace(calibration("fidelity"), least_support=0.05),
+            calibration=known,
         )
     return found
 
@@ -271,11 +277,17 @@ def drawn_cameras(seed: int, count: int) -> list[Camera]:
 
 
 def fidelity_case(
-    name: str, labels: Sequence[int], views: int, levels: int, seed: int, stored: Mapping[str, Case]
+    name: str,
+    labels: Sequence[int],
+    views: int,
+    levels: int,
+    seed: int,
+    stored: Mapping[str, Case],
+    last: float = 1.0,
 ) -> Case:
     """A case of fidelity; every fifth cell has one file less."""
     cells, cameras = make_cells(seed, labels, 2.5), drawn_cameras(seed, views)
-    models = fidelity_models(cells, cameras, levels, seed)
+    models = fidelity_models(cells, cameras, levels, seed, last)
     files = {c: list(range(1 + (c % 5 == 4 and levels > 1), levels + 1)) for c in cells.ids.tolist()}
     cost = costs_of([Ladder([1000 + 10 * c] * len(files[c])) for c in cells.ids.tolist()])
     document = fidelity_document(models, files, levels, cells, cost, cameras)
@@ -287,7 +299,7 @@ def fidelity_case(
         rng.uniform(size=expected.share.shape) * [len(files[c]) for c in cells.ids.tolist()]
     ).astype(int)
     mean = expected.of_composition(composed)
-    bound = promised(sent, expected, mean)
+    bound, of_last = (promised(sent, expected, one) for one in (mean, expected.last))
     points = [
         {
             **seen_from(camera),
@@ -303,6 +315,7 @@ def fidelity_case(
                 "support": expected.support[i].tolist(),
                 "mean": [_plain(value) for value in mean[i]],
                 "bound": [_plain(value) for value in bound[i]],
+                "last": [_plain(value) for value in of_last[i]],
             },
         }
         for i, camera in enumerate(there)
@@ -332,6 +345,7 @@ def promise_cases(stored: Mapping[str, Case] | None = None) -> list[Case]:
         fidelity_case("fidelity, a cell", [7], 3, 2, 11, known),
         fidelity_case("fidelity, cells of a label", [7] * 5, 16, 4, 12, known),
         fidelity_case("fidelity, cells of labels", [3, 3, 7, 7, 7, 7, 9, 9], 20, 5, 13, known),
+        fidelity_case("fidelity of an adopted splat", [3, 3, 7, 7, 7], 20, 4, 14, known, last=0.985),
     ]
 
 

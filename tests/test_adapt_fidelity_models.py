@@ -289,6 +289,25 @@ def test_a_category_that_is_never_shown_has_no_model():
     assert (planned[..., 2:] == K).all()
 
 
+def test_last_levels_that_are_not_the_full_model_keep_what_they_measure_everywhere():
+    """Those of an adopted splat: far from its cameras nothing was promised of them."""
+    cameras = viewpoints(60, 0)
+    table = sampled(cameras, 0)
+    last = 0.96 + 0.03 * np.random.default_rng(0).uniform(size=table.fidelity.shape[:2])
+    table.fidelity[..., -1] = last
+    models = fitted(table, cameras)
+    expected = expect(models, CELLS, viewpoints(40, 1), K)
+    for column, label in enumerate(expected.labels.tolist()):
+        kept = models[label].calibration.targets[-1]
+        worst = table.by_label(CELLS.label_of).fidelity[:, column, -1].min()
+        assert worst <= kept < 0.98
+        least = needed(models, expected, kept)[:, column]
+        assert (least[np.isfinite(least)] <= expected.last[np.isfinite(least), column]).all()
+        assert np.isinf(needed(models, expected, kept + 1e-6)[:, column]).all()
+        known = promised(models, expected, expected.last)[:, column]
+        np.testing.assert_allclose(known[np.isfinite(known)], kept)
+
+
 def test_one_viewpoint_and_one_level():
     cameras = viewpoints(1, 0)
     table = sampled(cameras, 0)

@@ -9,7 +9,8 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
     factor_u = (sum_i k_i v_ui + 0.001 v_u) / (sum_i k_i + 0.001)           k_i: by position and direction
                v_ui: true share over `apparent` in view i, what others leave of the cell; v_u: their mean
     mean     = sum_u share_u mean_u,level(u) / sum_u share_u                of the category's composition
-    needed   = 1 - (1 - threshold - slope * away) / strictness              of a target (`adapt.viewpoint`)
+    needed   = 1 - (1 - threshold - slope * away) / strictness              of a target (`adapt.viewpoint`),
+               at most the mean of all cells' last levels                   up to the last target
     strictness = field^0.2 s^0.05                                           of the lens and the screen, over
                                                                             that of the known views
 
@@ -130,6 +131,11 @@ class Expected:
         """Share of the picture's pixels of each category."""
         return self.share @ self.member
 
+    @property
+    def last(self) -> Float[np.ndarray, "V L"]:
+        """Expected fidelity of each category at the last level; NaN out of sight."""
+        return self.of_composition(np.full(self.share.shape, self.mean.shape[2]))
+
     def of_composition(self, levels: Int[np.ndarray, "V C"]) -> Float[np.ndarray, "V L"]:
         """Expected fidelity of each category in compositions (levels from 1); NaN out of sight."""
         at = np.take_along_axis(self.mean, levels[..., None] - 1, 2)[..., 0]
@@ -226,13 +232,14 @@ def promised(
     models: Mapping[int, FidelityModel], expected: Expected, composed: Float[np.ndarray, "V L"]
 ) -> Float[np.ndarray, "V L"]:
     """The largest target that each category keeps, by its composition's mean; NaN: nothing is promised."""
-    found = np.full(composed.shape, np.nan)
+    found, last = np.full(composed.shape, np.nan), expected.last
     for column, label in enumerate(expected.labels.tolist()):
         if label in models:
             calibration = models[label].calibration
             found[:, column] = calibration.bound(
-                composed[:, [column]], expected.support[:, column], expected.away, expected.strictness
-            )[:, 0]
+                composed[:, [column]], expected.support[:, column], expected.away, expected.strictness,
+                last[:, column],
+            )[:, 0]  # fmt: skip
     return found
 
 
@@ -240,12 +247,12 @@ def needed(
     models: Mapping[int, FidelityModel], expected: Expected, target: float
 ) -> Float[np.ndarray, "V L"]:
     """The mean from which on each category keeps a target; NaN: nothing is promised."""
-    found = np.full(expected.support.shape, np.nan)
+    found, last = np.full(expected.support.shape, np.nan), expected.last
     for column, label in enumerate(expected.labels.tolist()):
         if label in models:
             calibration, support = models[label].calibration, expected.support[:, column]
             least = support >= calibration.least_support
-            asked = calibration.needed(target, expected.away, expected.strictness)
+            asked = calibration.needed(target, expected.away, expected.strictness, last[:, column])
             found[:, column] = np.where(least, asked, np.nan)
     return found
 

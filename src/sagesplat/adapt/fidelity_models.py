@@ -180,6 +180,8 @@ def _fit(
         ],
         *_MARGINS,
     )
+    # that of an adopted splat is compared with what came in; of too few views the worst
+    last = max(-conformal_quantile(-category[:, -1], confidence), float(category[:, -1].min()))
     return FidelityModel(
         label_id=label,
         extent=extent,
@@ -192,7 +194,7 @@ def _fit(
         rmse=float(np.sqrt(((without - category) ** 2).mean(0)).mean()),
         calibration=_calibration(
             TARGETS + AT_A_PHOTO * margins, margins, "uncalibrated", confidence, 0,
-            _SPARSER * float(near[rows].max(1).min()),
+            _SPARSER * float(near[rows].max(1).min()), last,
         ),
     )  # fmt: skip
 
@@ -220,10 +222,13 @@ def _calibration(
     confidence: float,
     views: int,
     least: float,
+    last: float,
 ) -> Calibration:
-    """A calibration from the thresholds of TARGETS; the full model (mean 1) keeps all targets."""
-    targets, thresholds = np.append(TARGETS, 1.0), np.append(np.clip(thresholds + _ABOVE, -1, 1), 1.0)
-    return Calibration(status, confidence, views, targets, thresholds, np.append(slopes, 0.0), least)
+    """A calibration from the thresholds of TARGETS; up to `last` the last levels keep all, and above none."""
+    below = last > TARGETS
+    targets = np.append(TARGETS[below], last)
+    thresholds = np.append(np.clip(thresholds[below] + _ABOVE, -1, 1), 1.0)
+    return Calibration(status, confidence, views, targets, thresholds, np.append(slopes[below], 0.0), least)
 
 
 def plan_nominal(
@@ -449,7 +454,7 @@ def _with_needs(
 ) -> FidelityModel:
     now = model.calibration
     calibration = _calibration(
-        thresholds, slopes, now.status, now.confidence, now.num_views, now.least_support
+        thresholds, slopes, now.status, now.confidence, now.num_views, now.least_support, now.targets[-1]
     )
     return replace(model, calibration=calibration)
 

@@ -48,6 +48,7 @@ Status = Literal[
     "uncalibrated",  # too few calibration views for that: widened, but nothing is proven
 ]
 STATUSES: tuple[Status, ...] = get_args(Status)
+_ROUNDED = 1e-9  # by which sums of the same means differ
 _LARGEST_THRESHOLD = 1e6  # a bundle has them in whole steps
 
 
@@ -67,7 +68,7 @@ class Calibration:
     status: Status
     confidence: Annotated[float, Meta(gt=0, lt=1)]  # share of decisions that hold
     num_views: Count  # calibration views that show the category
-    targets: Float[np.ndarray, " G"]  # ascending
+    targets: Float[np.ndarray, " G"]  # ascending; above them nothing is kept
     thresholds: Float[np.ndarray, " G"]  # the mean from which on a level keeps the target, at a photo
     slopes: Float[np.ndarray, " G"]  # by which that rises to far from all photos
     least_support: Share  # below it there is no bound
@@ -78,16 +79,17 @@ class Calibration:
         support: Float[np.ndarray, " V"],
         away: Float[np.ndarray, " V"] | None = None,
         strictness: Float[np.ndarray, " V"] | float = 1.0,
+        most: Float[np.ndarray, " V"] | float = np.inf,
     ) -> Float[np.ndarray, "V K"]:
         """The largest target that each mean keeps; below the first target the same distance from the mean.
 
         NaN without any target, and where the support is too small. `away`: None: 1 - support. `strictness`
-        divides the loss that thresholds allow.
+        divides the loss that thresholds allow. `most`: the mean that keeps all targets, however far away.
         """
         away = 1 - support if away is None else away
         if not len(self.targets):
             return np.full(mean.shape, np.nan)
-        needed = self._needed(away, strictness)
+        needed = self._needed(away, strictness, most)
         found = np.array(
             [np.interp(m, n, self.targets) for m, n in zip(mean, needed, strict=True)], np.float64
         ).reshape(mean.shape)
@@ -101,20 +103,28 @@ class Calibration:
         target: float,
         away: Float[np.ndarray, " V"],
         strictness: Float[np.ndarray, " V"] | float = 1.0,
+        most: Float[np.ndarray, " V"] | float = np.inf,
     ) -> Float[np.ndarray, " V"]:
-        """The mean from which on a target is kept, this far away; between targets it is interpolated."""
+        """The mean from which on a target is kept (arguments: `bound`); inf: no level keeps it.
+
+        Between targets it is interpolated.
+        """
         if not len(self.targets):
             return np.full(len(away), np.nan)
-        known = self._needed(away, strictness)
-        found = np.array([np.interp(target, self.targets, row) for row in known])
+        known = self._needed(away, strictness, most)
+        found = np.array([np.interp(target, self.targets, row, right=np.inf) for row in known])
         return np.where(target < self.targets[0], known[:, 0] - (self.targets[0] - target), found)
 
     def _needed(
-        self, away: Float[np.ndarray, " V"], strictness: Float[np.ndarray, " V"] | float
+        self,
+        away: Float[np.ndarray, " V"],
+        strictness: Float[np.ndarray, " V"] | float,
+        most: Float[np.ndarray, " V"] | float,
     ) -> Float[np.ndarray, "V G"]:
         """The mean that each of the targets needs."""
         found = np.minimum(np.maximum.accumulate(self.thresholds + np.outer(away, self.slopes), 1), 1)
-        return 1 - (1 - found) / np.reshape(strictness, (-1, 1))
+        found = 1 - (1 - found) / np.reshape(strictness, (-1, 1))
+        return np.fmin(found, np.reshape(most, (-1, 1)) - _ROUNDED)
 
 
 NO_CALIBRATION = Calibration("uncalibrated", 0.95, 0, np.zeros(0), np.zeros(0), np.zeros(0), 0.0)

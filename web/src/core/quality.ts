@@ -35,6 +35,7 @@ type From = Pick<Viewpoint, "position" | "direction" | "focal" | "lens">;
 const STEP = 1e-4;
 const CORRECTION_STEP = 5e-3;
 const FACTOR_STEP = 0.05;
+const ROUNDED = 1e-9; // by which sums of the same means differ
 
 /** Eq. 3 at a distance, clamped to the fitted range; the median for an unknown distance (NaN). */
 export function curveAt(curve: Curve, distance: number): number {
@@ -69,6 +70,14 @@ export function boundOf({ targets, needed }: Keeps, mean: number): number {
   if (above === 0) return mean + (t1 - m1);
   const [t0, m0] = [at(targets, above - 1), at(needed, above - 1)];
   return t0 + ((t1 - t0) / (m1 - m0)) * (mean - m0);
+}
+
+/** All targets are kept by what is expected of the last levels, however far from photos. */
+export function keptByLast(outlook: Outlook, last: number): Outlook {
+  const { keeps } = outlook;
+  if (!keeps || Number.isNaN(last)) return outlook;
+  const needed = Float64Array.from(keeps.needed, (mean) => Math.min(mean, last - ROUNDED));
+  return { ...outlook, keeps: { targets: keeps.targets, needed } };
 }
 
 /** What is known whatever the viewpoint, until the viewpoint models are loaded: means of so many levels. */

@@ -6,6 +6,7 @@ import type { File } from "./download";
 import { type Candidate, type Group, LEAST_SHARE } from "./planner";
 import {
   boundOf,
+  keptByLast,
   LabelModel,
   levelsOf,
   meansAnywhere,
@@ -71,10 +72,15 @@ export class ViewpointModels {
       for (const { share } of family.entries) total += share;
     }
     const whole = Math.max(1, total);
-    for (const { entries } of families) {
-      for (const entry of entries) {
+    for (const family of families) {
+      let [last, seen] = [0, 0];
+      for (const entry of family.entries) {
         entry.share = entry.sight.visible ? Math.max(entry.share / whole, LEAST_SHARE) : 0;
+        if (entry.share > 0) last += entry.share * (entry.mean.at(-1) ?? Number.NaN);
+        seen += entry.share;
       }
+      if (this.models.get(family.label.id)?.whole === null)
+        family.outlook = keptByLast(family.outlook, last / seen);
     }
   }
 

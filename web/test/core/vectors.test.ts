@@ -54,6 +54,7 @@ interface FidelityView extends Viewpoint {
     readonly support: readonly number[]; // by label
     readonly mean: readonly Maybe[]; // of the composition
     readonly bound: readonly Maybe[];
+    readonly last: readonly Maybe[]; // bound of the last levels
   };
 }
 interface FidelityCase {
@@ -151,7 +152,7 @@ test.each(promiseCases.filter(isOfCells))("fidelity is that of the Python packag
     views.from(viewpoint);
     near(views.fromPhotos, expected.away, "away", SINGLE);
     for (const [i, { entries, outlook }] of families.entries()) {
-      let [sum, total] = [0, 0];
+      let [sum, last, total] = [0, 0, 0];
       for (const { cell, mean, share, sight } of entries) {
         near(share, expected.share[cell.id] as number, "share", SINGLE);
         const means = expected.means[cell.id] as readonly number[] | null;
@@ -160,14 +161,16 @@ test.each(promiseCases.filter(isOfCells))("fidelity is that of the Python packag
         expect(mean).toHaveLength(means.length);
         for (const [k, value] of means.entries()) near(mean[k] as number, value, "mean", SINGLE);
         sum += share * (mean[(levels[cell.id] as number) - 1] as number);
+        last += share * (mean.at(-1) as number);
         total += share;
       }
       near(sum / total, expected.mean[i] as Maybe, "of the composition", SINGLE);
       if (!total) continue;
       near(outlook.support, expected.support[i] as number, "support", SINGLE);
       const { keeps } = outlook;
-      const bound = keeps ? boundOf(keeps, sum / total) : Number.NaN;
-      near(bound, expected.bound[i] as Maybe, "bound", SINGLE);
+      const bound = (mean: number) => (keeps ? boundOf(keeps, mean) : Number.NaN);
+      near(bound(sum / total), expected.bound[i] as Maybe, "bound", SINGLE);
+      near(bound(last / total), expected.last[i] as Maybe, "bound of the last levels", SINGLE);
     }
   }
 });
