@@ -93,7 +93,8 @@ def main(
         folder: where the scenes are run; what is done there already is not run again.
         scenes: which of them.
         views: fresh viewpoints a scene, drawn by the run's rule.
-        by_condition: fresh viewpoints for each of: path at half, one and twice the pixels, walk, back.
+        by_condition: fresh viewpoints for each of: path at half, one and twice the pixels, walk, back;
+            and for three wide lenses.
         redraws: of calibration and test photos.
         write: keep the figures in benchmarks/results/cpu/promises.json.
     """

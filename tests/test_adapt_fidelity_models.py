@@ -240,7 +240,11 @@ def test_wide_lenses_and_fine_screens_ask_for_more():
     wide = replace(camera, width=2 * camera.width, height=2 * camera.height)
     fine = replace(wide, K=camera.K * np.array([[2], [2], [1]], np.float32))  # the same lens
     allowed = 1 - needed(models, expect(models, CELLS, [camera, wide, fine], K), 0.8)
-    np.testing.assert_allclose(allowed[0] / allowed[1:], [[2**0.2] * 2, [2**0.05] * 2])
+    screens, fields = np.log([[1, 1, 2], [1, 2, 1]]) + np.log(
+        [[1.0], [np.sqrt(camera.width * camera.height)]]
+    )
+    asked = np.exp(0.25 * fields + 0.1 * screens - 0.2 * fields * screens)
+    np.testing.assert_allclose(allowed * asked[:, None], np.repeat(allowed[:1], 3, 0) * asked[0])
 
 
 def test_shares_are_those_that_were_seen():

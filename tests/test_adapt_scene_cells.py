@@ -107,7 +107,7 @@ def test_by_how_much_a_composition_exceeds_its_target_is_said() -> None:
     assert least == dict.fromkeys((3, 7), pytest.approx(-0.01))
 
 
-def _searched(response, target: float, rounds: int = 9, settling: int = 5) -> list[tuple[list, list]]:
+def _searched(response, target: float, rounds: int = 9, settling: int = 4) -> list[tuple[list, list]]:
     """What a search asks for in each round, and by how much categories are over the target by `response`.
 
     `response` takes what is asked, and gives the bytes of categories (1: all) and what they measure.

@@ -11,7 +11,7 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
     mean     = sum_u share_u mean_u,level(u) / sum_u share_u                of the category's composition
     needed   = 1 - (1 - threshold - slope * away) / strictness              of a target (`adapt.viewpoint`),
                at most the mean of all cells' last levels                   up to the last target
-    strictness = field^0.2 s^0.05                                           of the lens and the screen, over
+    strictness = exp(0.25 f + 0.1 s - 0.2 f s)                              logs of field and screen; over
                                                                             that of the known views
 
 A target is kept where the mean reaches what is needed. Through wide lenses and on fine screens compositions
@@ -48,7 +48,8 @@ from sagesplat.scene.scene import Camera
 LEAST_SHARE = 1e-4  # of a cell in sight: it may be there though it was hidden in all known views
 MOST_FACTOR = 4.0  # of a share over what it would be unhidden
 _PRIOR = 1e-3  # weight of a factor's mean
-_STRICTER = np.array([0.05, 0.2])  # powers of screen and field: docs/developers/promises.md compares them
+_STRICTER = np.array([0.1, 0.25])  # of screen and field: docs/developers/promises.md compares them
+_BOTH_STRICTER = -0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +192,8 @@ def strictness_of(
     views: Float[np.ndarray, "V 8"], known: Float[np.ndarray, "N 8"]
 ) -> Float[np.ndarray, " V"]:
     """What divides the loss that thresholds allow, of viewpoints (`views_of`); `known`: those of a model."""
-    return np.exp((views[:, 6:] - known[:, 6:].mean(0)) @ _STRICTER)
+    here, usual = (of[:, 6:] @ _STRICTER + _BOTH_STRICTER * of[:, 6] * of[:, 7] for of in (views, known))
+    return np.exp(here - usual.mean())
 
 
 def cell_means(

@@ -68,6 +68,9 @@ _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more 
 # those walking and 14 % of those stepping back had no promise with 1, 2 % and 6 % have none with this.
 _SPARSER = 0.7
 _NEAR = 0.3  # `Expected.away` of viewpoints that count as on the capture's path
+# Of the share of decisions that may miss: on some screens and through some lenses more do than of all
+# viewpoints, and each kind is to keep its share (docs/developers/promises.md).
+_OF_MISSES = 0.8
 _FEW = 10  # viewpoints on it, and off it, from which on both are looked at
 
 
@@ -413,14 +416,18 @@ def calibrated(
         on the capture's path and off it, each by itself. With fewer the nominal targets are the largest ones
         of all categories and of its own: "uncalibrated".
     """
-    fewest = fewest_views(confidence)
+    fewest, stricter = fewest_views(confidence), 1 - _OF_MISSES * (1 - confidence)
     decisions = {label: trial.decisions(label) for label in models}
 
     def conformal(label: int, kind: bool | None) -> Float[np.ndarray, " G"]:
         of_others = [one.at(kind) for other, one in decisions.items() if other != label]
         others = np.hstack([np.zeros((len(TARGETS), 0)), *of_others])
-        rows = zip(decisions[label].at(kind), others, strict=True)
-        values = np.array([conformal_quantile(own, confidence, other) for own, other in rows])
+        rows = list(zip(decisions[label].at(kind), others, strict=True))
+        values, lax = (
+            np.array([conformal_quantile(own, share, other) for own, other in rows])
+            for share in (stricter, confidence)
+        )
+        values = np.where(np.isinf(values), lax, values)  # too few viewpoints to be stricter
         return np.where(held, np.maximum(values, TARGETS), values)
 
     asked = {label: conformal(label, None) for label, one in decisions.items() if len(one.away) >= fewest}

@@ -37,12 +37,14 @@ class Search:
         """Ask for something else by how much a plan's categories exceed the target; False: nothing is left.
 
         `settle`: ask for what was enough. A category that misses the target with all it can get lies beside
-        others that spill over it: these count as missing as much.
+        others that spill over it: those that were lowered, else all, count as missing half of that.
         """
         before, sent = dict(self.asked), {choice.label_id: choice.transfer_bytes for choice in plan.choices}
         spilt = max((-by for label, by in over.items() if sent[label] == self._most[label]), default=0.0)
+        lowered = {label for label, enough in self._enough.items() if enough > before[label]} or set(over)
         for label, by in over.items():
-            self.asked[label] = self._next(label, min(by, -spilt) if spilt > 0 else by, settle)
+            spills = spilt > 0 and label in lowered
+            self.asked[label] = self._next(label, min(by, -spilt / 2) if spills else by, settle)
         return self.asked != before
 
     def _next(self, label: int, by: float, settle: bool) -> float:

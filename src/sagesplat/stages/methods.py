@@ -58,7 +58,7 @@ _RAISES = 6  # times that a plan is measured in its composition, and its failing
 # at so many viewpoints at most: dinosaur's plans take 18 s (with all 194 38 s, and 0 to 3 % more bytes)
 _VIEWPOINTS = 128
 _ROUNDS = 9  # of a search for plans by cell; from so many before its end, what was enough is asked for
-_SETTLING = 5
+_SETTLING = 4
 
 
 class NestedLevels(Method):

@@ -97,8 +97,12 @@ const HALF_WEIGHT = 1e-3;
 
 const COLUMNS = 8; // of the shared views: position over the extent, direction, log screen, log field
 const PHOTO_COLUMNS = 6; // of the photos: position and direction
-const [STRICTER_SCREEN, STRICTER_FIELD] = [0.05, 0.2] as const; // powers of screen and field
+const [STRICTER_SCREEN, STRICTER_FIELD, STRICTER_BOTH] = [0.1, 0.25, -0.2] as const; // of logs of screen and field
 const PLACE_LENGTHS = [0.3, 0.5] as const; // of position and direction, for photos and factors
+
+function logStrictness(screen: number, field: number): number {
+  return STRICTER_SCREEN * screen + STRICTER_FIELD * field + STRICTER_BOTH * screen * field;
+}
 
 /** The views that the models of all labels share, and how far they are from the current viewpoint. */
 export class Views {
@@ -122,10 +126,11 @@ export class Views {
     this.turned = new Float64Array(count);
     this.rescaled = new Float64Array(count);
     this.alike = new Float64Array(count);
-    const mean = (column: number) =>
-      this.rows.reduce((sum, value, at) => (at % COLUMNS === column ? sum + value : sum), 0) /
-      Math.max(count, 1);
-    this.usual = STRICTER_SCREEN * mean(6) + STRICTER_FIELD * mean(7);
+    let sum = 0;
+    for (let at = 0; at < this.rows.length; at += COLUMNS) {
+      sum += logStrictness(this.rows[at + 6] as number, this.rows[at + 7] as number);
+    }
+    this.usual = sum / Math.max(count, 1);
   }
 
   /** Computes the differences from a viewpoint, once for all labels. */
@@ -137,7 +142,7 @@ export class Views {
     const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), smallest), largest));
     // SSIM is known in the photos' pictures alone
     const field = sent.quality === "ssim" ? 0 : Math.log(fieldOf(viewpoint));
-    this.strictness = Math.exp(STRICTER_SCREEN * screen + STRICTER_FIELD * field - this.usual);
+    this.strictness = Math.exp(logStrictness(screen, field) - this.usual);
     const [position, direction] = PLACE_LENGTHS;
     for (let i = 0, at = 0; i < this.away.length; i++, at += COLUMNS) {
       const away = square(x, y, z, rows, at);
