@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from sagesplat.adapt.bound_plans import Costs
 from sagesplat.adapt.plan import Plan
 
-_CLOSE = 0.004  # fidelity asked for, between what is enough and what is not
+_CLOSE = 0.004  # fidelity: over the target; asked for, between what is enough and what is not
 _FURTHER = 1.2  # times what is missed
 _PRIOR = 1e-3  # of a gain where the target is kept already, beside one where it is missed
 
@@ -39,6 +39,8 @@ class Search:
         `settle`: ask for what was enough. A category that misses the target with all it can get lies beside
         others that spill over it: those that were lowered, else all, count as missing half of that.
         """
+        if all(0 <= by <= _CLOSE for by in over.values()):
+            return False
         before, sent = dict(self.asked), {choice.label_id: choice.transfer_bytes for choice in plan.choices}
         spilt = max((-by for label, by in over.items() if sent[label] == self._most[label]), default=0.0)
         lowered = {label for label, enough in self._enough.items() if enough > before[label]} or set(over)
