@@ -192,8 +192,17 @@ def test_a_finished_workspace_is_kept(solved, monkeypatch):
     assert (out / "poses.json").read_text() == before
 
 
+class Ended(subprocess.Popen):
+    """Whose context has nothing to wait for: after Ctrl-C it would for a quarter of a second only."""
+
+    def __exit__(self, *raised: object) -> None:
+        assert self.returncode is not None
+        super().__exit__(*raised)  # type: ignore[arg-type]
+
+
 @needs_pycolmap
-def test_a_stopped_run_goes_on(folder: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_goes_on(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subprocess, "Popen", Ended)
     out, config = tmp_path / "out", replace(CONFIG, max_size=200)
 
     def stop(stage: str, done: int, total: int) -> None:

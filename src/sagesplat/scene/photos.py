@@ -233,6 +233,7 @@ def _run(work: Path, on_progress: OnProgress) -> dict[str, Any]:
             code = child.wait()
         finally:
             child.kill()
+            child.wait()  # after Ctrl-C the context waits a quarter of a second only
     if "unavailable" in answer:
         raise BackendUnavailable(answer["unavailable"])
     if code == 0 and "result" in answer:
