@@ -195,9 +195,14 @@ def test_a_finished_workspace_is_kept(solved, monkeypatch):
 class Ended(subprocess.Popen):
     """Whose context has nothing to wait for: after Ctrl-C it would for a quarter of a second only."""
 
-    def __exit__(self, *raised: object) -> None:
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: types.TracebackType | None,
+    ) -> None:
         assert self.returncode is not None
-        super().__exit__(*raised)  # type: ignore[arg-type]
+        super().__exit__(exc_type, value, traceback)
 
 
 @needs_pycolmap
