@@ -423,11 +423,10 @@ def calibrated(
         of_others = [one.at(kind) for other, one in decisions.items() if other != label]
         others = np.hstack([np.zeros((len(TARGETS), 0)), *of_others])
         rows = list(zip(decisions[label].at(kind), others, strict=True))
-        values, lax = (
-            np.array([conformal_quantile(own, share, other) for own, other in rows])
-            for share in (stricter, confidence)
-        )
-        values = np.where(np.isinf(values), lax, values)  # too few viewpoints to be stricter
+        values = np.full(len(TARGETS), np.inf)
+        for share in (stricter, confidence):  # from too few viewpoints, as strict as promised
+            if np.isinf(values).any():
+                values = np.array([conformal_quantile(own, share, other) for own, other in rows])
         return np.where(held, np.maximum(values, TARGETS), values)
 
     asked = {label: conformal(label, None) for label, one in decisions.items() if len(one.away) >= fewest}

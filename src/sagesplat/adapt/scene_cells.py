@@ -20,6 +20,7 @@ from sagesplat.adapt.plan import Plan
 
 _CLOSE = 0.004  # fidelity: over the target; asked for, between what is enough and what is not
 _FURTHER = 1.2  # times what is missed
+_ROUNDS, _SEARCHED = 9, 4  # of a search at most; after so many, what was enough is asked for
 _PRIOR = 1e-3  # of a gain where the target is kept already, beside one where it is missed
 
 
@@ -32,25 +33,29 @@ class Search:
         self.asked = {choice.label_id: plan.target for choice in plan.choices if choice.status == "ok"}
         self._too_little = dict[int, float]()  # by category, the most that was
         self._enough = dict[int, float]()  # the least that was
+        self._rounds = 0
 
-    def narrow(self, plan: Plan, over: Mapping[int, float], *, settle: bool) -> bool:
+    def narrow(self, plan: Plan, over: Mapping[int, float]) -> bool:
         """Ask for something else by how much a plan's categories exceed the target; False: nothing is left.
 
-        `settle`: ask for what was enough. A category that misses the target with all it can get lies beside
-        others that spill over it: those that were lowered, else all, count as missing half of that.
+        A category that misses the target with all it can get lies beside others that spill over it: those
+        that were lowered are asked for what was enough; else all count as missing half of that.
         """
-        if all(0 <= by <= _CLOSE for by in over.values()):
+        self._rounds += 1
+        if self._rounds == _ROUNDS or all(0 <= by <= _CLOSE for by in over.values()):
             return False
         before, sent = dict(self.asked), {choice.label_id: choice.transfer_bytes for choice in plan.choices}
         spilt = max((-by for label, by in over.items() if sent[label] == self._most[label]), default=0.0)
-        lowered = {label for label, enough in self._enough.items() if enough > before[label]} or set(over)
+        lowered = {label: more for label, more in self._enough.items() if more > before[label]}
         for label, by in over.items():
-            spills = spilt > 0 and label in lowered
-            self.asked[label] = self._next(label, min(by, -spilt / 2) if spills else by, settle)
+            spills = spilt > 0 and not lowered
+            self.asked[label] = self._next(label, min(by, -spilt / 2) if spills else by)
+        if spilt > 0:
+            self.asked |= lowered
         return self.asked != before
 
-    def _next(self, label: int, by: float, settle: bool) -> float:
-        asked = self.asked[label]
+    def _next(self, label: int, by: float) -> float:
+        asked, settle = self.asked[label], self._rounds > _SEARCHED
         # what was found beside other neighbours may no longer be so
         if by >= 0:
             self._enough[label] = asked

@@ -55,10 +55,9 @@ from sagesplat.stages.snapshots import Snapshots
 from sagesplat.stages.viewpoints import fit_viewpoints
 
 _RAISES = 6  # times that a plan is measured in its composition, and its failing levels raised
-# at so many viewpoints at most: dinosaur's plans take 18 s (with all 194 38 s, and 0 to 3 % more bytes)
+# At so many viewpoints at most: before they were searched, dinosaur's plans took 18 s (with all 194 38 s, and
+# 0 to 3 % more bytes).
 _VIEWPOINTS = 128
-_ROUNDS = 9  # of a search for plans by cell; from so many before its end, what was enough is asked for
-_SETTLING = 4
 
 
 class NestedLevels(Method):
@@ -261,20 +260,18 @@ class NestedLevels(Method):
             for i, plan in enumerate(plans)
             if plan.quality == "fidelity" and share < 1
         }
-        for left in reversed(range(_ROUNDS)):
+        while searches:
             tried = {
                 i: thinned(plans[i], sampled.fidelity, pixels, self.cell_costs, label_of, search.asked)
                 for i, search in searches.items()
             }
-            if not tried:
-                break
             measured = self._in_composition(list(tried.values()), cameras)
             for j, (i, plan) in enumerate(tried.items()):
                 plan, over = measured_in_composition(plan, measured[:, j], proven=False)
                 held = min(over.values(), default=0.0) >= 0
                 if held and (i not in found or (plan.transfer_bytes or 0) < (found[i].transfer_bytes or 0)):
                     found[i] = plan
-                if not searches[i].narrow(plan, over, settle=left <= _SETTLING):
+                if not searches[i].narrow(plan, over):
                     del searches[i]
         return found
 
