@@ -22,7 +22,17 @@ from typing import Any
 
 import numpy as np
 
-from sagesplat.adapt.cell_models import CellModel, FidelityModel, expect, promised, views_of
+from sagesplat.adapt.cell_models import (
+    FACTOR_STEP,
+    LOG_STEP,
+    STEP,
+    TERMS,
+    CellModel,
+    FidelityModel,
+    expect,
+    promised,
+    views_of,
+)
 from sagesplat.adapt.cells import POINTS, STEPS, Cells, label_distances, look
 from sagesplat.adapt.eq3 import Eq3, SsimModel
 from sagesplat.adapt.viewpoint import (
@@ -35,7 +45,6 @@ from sagesplat.adapt.viewpoint import (
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer.frames import FLIP, camera_at
 from sagesplat.viewer.manifest import placed
-from sagesplat.viewer.pack import Ladder, costs_of
 from sagesplat.viewer.promises import Seen, fidelity_document, ssim_document
 from sagesplat.viewer.sent_model import read_fidelity, read_model
 
@@ -163,17 +172,18 @@ def fidelity_models(
     if last < 1:
         known = replace(known, targets=np.append(known.targets[:-1], last - 0.01))
     rng, found = np.random.default_rng(seed), {}
-    views = views_of(cameras, EXTENT, FOCAL, SCREENS)
+    views = np.round(views_of(cameras, EXTENT, FOCAL, SCREENS) / STEP) * STEP
+    places = (np.arange(levels) + 0.5) / levels
     for label in np.unique(cells.labels).tolist():
         made = []
         for i, cell in enumerate(cells.ids[cells.labels == label].tolist()):
             rows = np.flatnonzero(rng.uniform(size=len(views)) < (0.0 if cell % 3 == 2 else 0.7))
             factors = np.where(rng.uniform(size=len(views)) < (0.9 if i % 4 == 3 else 0.3), -1.0, 0.0)
-            factors = np.where(factors < 0, factors, rng.uniform(0, 1.5, len(views)))
-            offsets = np.append(np.sort(rng.uniform(0.6, last - 0.02, levels - 1)), last)
-            weights = rng.normal(0, 0.03, (levels, len(rows))) * (np.arange(levels) < levels - 1)[:, None]
-            logs = rng.normal(0.8, 0.4, len(rows))
-            made.append(CellModel(cell, offsets, rows, logs, 0.7, weights, factors))
+            factors = np.where(factors < 0, factors, FACTOR_STEP * rng.integers(0, 30, len(views)))
+            offsets = np.append(np.sort(rng.uniform(0.6, last - 0.02, levels - 1)), last).round(4)
+            values = np.round(rng.normal(0, 5, (TERMS, len(rows)))).astype(int)
+            logs = LOG_STEP * np.round(rng.normal(0.8, 0.4, len(rows)) / LOG_STEP)
+            made.append(CellModel(cell, offsets, places, rows, logs, 0.7, values, factors))
         found[label] = FidelityModel(
             label_id=label,
             extent=EXTENT,
@@ -289,11 +299,10 @@ def fidelity_case(
     cells, cameras = make_cells(seed, labels, 2.5), drawn_cameras(seed, views)
     models = fidelity_models(cells, cameras, levels, seed, last)
     files = {c: list(range(1 + (c % 5 == 4 and levels > 1), levels + 1)) for c in cells.ids.tolist()}
-    cost = costs_of([Ladder([1000 + 10 * c] * len(files[c])) for c in cells.ids.tolist()])
-    document = fidelity_document(models, files, levels, cells, cost, cameras)
+    document = fidelity_document(models, files, levels, cameras)
     there = [*cameras[:3], *drawn_cameras(seed + 1, 4), posed((900.0, 0, 0), AHEAD)]
     sent = read_fidelity(stored.get(name, document))
-    expected = expect(sent, cells, there, cost.shape[1])
+    expected = expect(sent, cells, there, max(map(len, files.values())))
     rng = np.random.default_rng(seed)
     composed = 1 + (
         rng.uniform(size=expected.share.shape) * [len(files[c]) for c in cells.ids.tolist()]

@@ -316,7 +316,7 @@ def test_one_viewpoint_and_one_level():
     cameras = viewpoints(1, 0)
     table = sampled(cameras, 0)
     models = fitted(table, cameras)
-    assert all(np.isfinite(cell.weights).all() for cell in models[3].cells)
+    assert all(np.isfinite(cell.values).all() for cell in models[3].cells)
     single = replace(table, fidelity=table.fidelity[..., -1:], whole=table.whole[:, -1:])
     models = fitted(single, cameras)
     expected = expect(models, CELLS, cameras, 1)

@@ -22,7 +22,7 @@ from make_viewer_vectors import SCREENS, calibration, model
 from page_checks import wrong_with, wrong_with_keyboard
 from PIL import Image
 
-from sagesplat.adapt.cell_models import CellModel, FidelityModel, views_of
+from sagesplat.adapt.cell_models import TERMS, CellModel, FidelityModel, views_of
 from sagesplat.adapt.cells import describe_cells
 from sagesplat.adapt.process import inputs_of
 from sagesplat.adapt.viewpoint import Calibration, QualityKind, ViewModel, where
@@ -179,8 +179,8 @@ def promised_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def fidelity(label: int) -> FidelityModel:
         nothing = np.zeros(0)
         cell = CellModel(
-            label, np.array([0.6, 0.73, 0.87, 1.0]), nothing.astype(int), nothing, np.log(5.0),
-            np.zeros((4, 0)), np.full(len(views), -1.0),
+            label, np.array([0.6, 0.73, 0.87, 1.0]), np.arange(0.125, 1, 0.25), nothing.astype(int), nothing,
+            np.log(5.0), np.zeros((TERMS, 0), int), np.full(len(views), -1.0),
         )  # fmt: skip
         return FidelityModel(
             label, 1.0, camera().focal, SCREENS, known, LENGTHS, views[:, :6].T, (cell,), 0.0,

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from base64 import b64decode
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,7 @@ from sagesplat.adapt.cells import POINTS, Cells, describe_cells
 from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, ViewModel
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.increments import ranges_of, totals, write_increments
+from sagesplat.formats.increments import DIGITS, ranges_of, totals, write_increments
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
 from sagesplat.formats.stream_header import AS_GIVEN
@@ -225,8 +226,7 @@ def test_compositions_are_promised_no_more_than_before_they_were_sent(labels, vi
     cells, drawn = make_cells(seed, labels, 2.5), drawn_cameras(seed, views)
     models = fidelity_models(cells, drawn, 5, seed)
     files = {cell: [1, 2, 3, 4, 5] for cell in cells.ids.tolist()}
-    cost = np.tile(np.arange(1, 6) * 1000, (len(labels), 1))
-    document = json.loads(json.dumps(fidelity_document(models, files, 5, cells, cost, drawn)))
+    document = json.loads(json.dumps(fidelity_document(models, files, 5, drawn)))
     shorter = [2 * np.degrees(np.arctan(min(one.width, one.height) / 2 / one.focal)) for one in drawn]
     assert document["fov"] == round(max(shorter))
     read = read_fidelity(document)
@@ -237,9 +237,10 @@ def test_compositions_are_promised_no_more_than_before_they_were_sent(labels, vi
         known = promised(models, before, before.of_composition(levels))
         told = promised(read, after, after.of_composition(levels))
         asked = (known >= 0.3) & np.isfinite(told)
-        assert (told[asked] <= known[asked] + 5e-3).all()
+        assert (told[asked] <= known[asked] + 1e-4).all()
         assert (np.isfinite(told) <= np.isfinite(known)).all()
-    np.testing.assert_allclose(after.share, before.share, atol=0.02)
+    np.testing.assert_allclose(after.share, before.share, atol=1e-9)
+    np.testing.assert_allclose(after.mean, before.mean, atol=1e-4)
     full = promised(read, after, after.of_composition(np.full(before.share.shape, 5)))
     assert (full[np.isfinite(full)] == 1).all()
 
@@ -372,14 +373,17 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
     ]  # fmt: skip
     total = 0
     for cell in cells:
-        points, bounds = np.array(cell["points"]).reshape(-1, 4), np.array(cell["bounds"])
+        points, bounds = (
+            np.frombuffer(b64decode(cell["points"]), np.uint8).reshape(-1, 4),
+            np.array(cell["bounds"]),
+        )
         there = bounds[:3] + points[:, :3] / 255 * (bounds[3:] - bounds[:3])
         known = contents.cells.points()[cell["id"], : len(there)] * FLIP
         np.testing.assert_allclose(there, known, atol=1e-4)
         for level in cell["levels"]:
             content = (out / level["uri"]).read_bytes()
             assert len(content) == level["bytes"]
-            assert hashlib.sha256(content).hexdigest()[:16] == level["sha256"]
+            assert hashlib.sha256(content).hexdigest()[:DIGITS] == level["sha256"]
             assert len(read_spz(out / level["uri"])) == level["count"]
             total += len(content)
     assert manifest["totals"]["bytes"] == written.chunks == total
@@ -434,7 +438,7 @@ def packed_parts(out: Path) -> list[list[int]]:
     for cell, level in pack["order"]:
         entry = levels[cell][level - 1]
         part = content[at : at + entry["bytes"]]
-        assert hashlib.sha256(part).hexdigest()[:16] == entry["sha256"]
+        assert hashlib.sha256(part).hexdigest()[:DIGITS] == entry["sha256"]
         at += len(part)
     assert at == len(content) == pack["bytes"]
     assert pack["sha256"] == hashlib.sha256(content).hexdigest()
@@ -520,7 +524,7 @@ def test_a_palette_is_the_first_range_of_its_file(tmp_path, contents, viewer) ->
         assert {one["uri"] for one in levels} == {palette["uri"]}
         begin = min(one["offset"] for one in levels if "offset" in one)
         assert (palette["offset"], palette["bytes"]) == (0, begin)
-        assert hashlib.sha256(content[: palette["bytes"]]).hexdigest()[:16] == palette["sha256"]
+        assert hashlib.sha256(content[: palette["bytes"]]).hexdigest()[:DIGITS] == palette["sha256"]
         assert palette["bytes"] + sum(one["bytes"] for one in levels) == len(content)
     uri = made.increments[0].uri
     damaged = bytearray((tmp_path / "chunks" / uri).read_bytes())

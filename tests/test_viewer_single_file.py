@@ -13,7 +13,7 @@ from conftest import pinhole, random_gaussians
 
 from sagesplat.adapt.cells import describe_cells
 from sagesplat.core.errors import DataError, RunError
-from sagesplat.formats.increments import write_increments
+from sagesplat.formats.increments import DIGITS, write_increments
 from sagesplat.formats.stream_header import AS_GIVEN
 from sagesplat.formats.stream_increments import write_streams
 from sagesplat.viewer import single_file
@@ -78,7 +78,7 @@ def test_everything_is_in_the_page(tmp_path, viewer, contents) -> None:
     assert (files.pop("THIRD_PARTY_LICENSES.txt"), b"Apache" in files.pop("LICENSES.txt")) == (b"MIT", True)
     assert files.pop("assets/spark.wasm") == b"\0asm"  # there are levels in SPZ
     levels = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
-    assert [hashlib.sha256(files[level["uri"]]).hexdigest()[:16] for level in levels] == [
+    assert [hashlib.sha256(files[level["uri"]]).hexdigest()[:DIGITS] for level in levels] == [
         level["sha256"] for level in levels
     ]
     assert len(files) == len(levels)

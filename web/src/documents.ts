@@ -10,6 +10,8 @@ export type Path = string;
 export type Digits = string;
 /** Smallest x y z, largest x y z. */
 export type Box = [number, number, number, number, number, number];
+/** A list of bytes in base64. */
+export type Bytes = string;
 /** A range of a coded stream, of which a cell has one, and a file those of a label; or SPZ version 3; or a binary PLY in INRIA's layout, its y and z opposite to the bundle's. */
 export type Format = "stream" | "spz" | "ply";
 /** Whether a bound holds at its confidence, or calibration views were too few for that. */
@@ -117,8 +119,7 @@ export interface Cell {
   /** No other cell of the bundle has it. */
   id: number;
   bounds: Box;
-  /** x y z w of each point: its position along each axis of the bounds, and its part of the area, in 1/255 of the bounds and of the sum of all w. */
-  points: number[];
+  points: Bytes;
   /** That all points stand for, world units squared. */
   area: number;
   /** By how far Gaussians lie around their point, world units. */
@@ -186,6 +187,8 @@ export interface Promises {
   focal: number;
   /** Screens that promises are for, from and to; others count as the nearer end. */
   screens: [number, number];
+  /** Of fidelity: of the ladder that cells' levels are of. */
+  levels?: number;
   /** Of fidelity: the widest lens that was tried, degrees of the picture's shorter side. */
   fov?: number;
   /** By axis (x y z over the extent, direction, log screen, log field) and view, in 1/10000. */
@@ -212,8 +215,10 @@ export interface LabelPromises {
 export interface CellPromises {
   /** -1: all cells of the label. */
   id: number;
-  /** 1-based levels with a prediction. */
-  levels: number[];
+  /** Of a cell: by level, which of the ladder's it is. */
+  ladder?: number[];
+  /** Of a label as a whole: 1-based levels with a prediction. */
+  levels?: number[];
   /** For an unknown distance. */
   medianLogDistance: number;
   /** By level. */
@@ -225,8 +230,10 @@ export interface CellPromises {
     unit: Unit;
     steps: Steps;
   };
-  /** By level and own view: differences along both. */
-  values: {
+  /** Of a cell: by cosine over the ladder and own view, in 3/100 of what is missing at a level. */
+  terms?: Steps[];
+  /** Of a label as a whole: by level and own view, differences along both. */
+  values?: {
     units: Unit[];
     steps: Steps[];
   };

@@ -107,6 +107,7 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
     extent,
     focal: FOCAL,
     screens: [0.5, 2],
+    levels: 16,
     views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6), column(7)],
     photos: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) => {

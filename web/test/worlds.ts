@@ -216,13 +216,16 @@ function labelOf(id: number, cells: readonly (readonly Level[])[], random: () =>
   };
 }
 
+/** Points of a cell as a manifest has them. */
+export const base64 = (points: readonly number[]): string => btoa(String.fromCharCode(...points));
+
 /** A cell that fills a box: points at its corners and in its middle. */
 export function cellOf(id: number, bounds: Cell["bounds"], levels: readonly Level[]): Cell {
   const ends = [0, 255];
   const corners = ends.flatMap((x) => ends.flatMap((y) => ends.flatMap((z) => [x, y, z, 100])));
   const size = (axis: 0 | 1 | 2) => bounds[(axis + 3) as 3] - bounds[axis];
   const area = size(0) * size(1) + size(1) * size(2);
-  return { id, bounds, points: [...corners, 128, 128, 128, 255], area, radius: 0.2, levels };
+  return { id, bounds, points: base64([...corners, 128, 128, 128, 255]), area, radius: 0.2, levels };
 }
 
 /** What holds everywhere, for these means by level. */
@@ -262,15 +265,12 @@ export function modelOf(
 ): CellPromises {
   return {
     id,
-    levels: means.map((_, k) => k + 1),
+    ladder: means.map((_, k) => k + 1),
     medianLogDistance: 1.6,
     offsets: means,
     views: differences(rows),
     logDistances: { unit: 0.01, steps: differences(rows.map(() => 150 + 30 * random())) },
-    values: {
-      units: means.map(() => 1e-3),
-      steps: means.map(() => differences(rows.map(() => 2 * (random() - 0.5)))),
-    },
+    terms: means.map(() => rows.map(() => Math.round(2 * (random() - 0.5)))),
   };
 }
 
@@ -296,6 +296,7 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
     focal: FOCAL,
     screens: [0.5, 2],
     fov: 53,
+    levels: 16,
     views: [column(0), column(1), column(2), column(3), column(4), column(5), column(6), column(7)],
     photos: [column(0), column(1), column(2), column(3), column(4), column(5)],
     labels: labels.map((label) =>

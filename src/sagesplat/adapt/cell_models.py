@@ -2,8 +2,12 @@
 
 Levels are chosen cell by cell; what is promised is the category's fidelity, over the pixels of its cells:
 
-    mean_uk  = offset_uk + sum_i c(x, x_i) weights_uik, made monotone       of cell u at level k; c, x: the
-               kernel and the inputs of `adapt.process`, with the distance of the cell (`adapt.cells`)
+    mean_uk  = offset_uk + missing_uk * sum_j cos(pi j t_k) p_uj            of cell u at level k, monotone;
+               t_k = (k - 1/2) / K, j = 0 to 5
+    missing  = max(1 - offset, 0.025); 0 where the offset is 1
+    p_uj     = sum_i c(x, x_i) weights_uij                                  c, x: the kernel and the inputs of
+               (C + 0.001 I) weights = values, C_ij = c(x_i, x_j)           `adapt.process`, with the distance
+                                                                            of the cell (`adapt.cells`)
     share_u  = apparent_u * factor_u / max(1, sum over all cells)           of the picture's pixels; of a cell
                                                                             in sight at least 0.0001
     factor_u = (sum_i k_i v_ui + 0.001 v_u) / (sum_i k_i + 0.001)           k_i: by position and direction
@@ -13,6 +17,10 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
                at most the mean of all cells' last levels                   up to the last target
     strictness = exp(0.25 f + 0.1 s - 0.2 f s)                              logs of field and screen; over
                                                                             that of the known views
+
+So what is missing to the full model, over what is missing on average, is a few cosines over the levels. Six
+leave 5 % of it, less than a tenth of what a cell is uncertain by, and are half as much to send as the levels.
+Numbers are whole steps of units: a viewer has the same ones (`viewer.promises`).
 
 A target is kept where the mean reaches what is needed. Through wide lenses and on fine screens compositions
 measure less than their means more often, and thresholds are found over all of them: hence the strictness. A
@@ -27,6 +35,7 @@ from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import cho_factor, cho_solve
 
 from sagesplat.adapt.cells import Cells, Sight, look
 from sagesplat.adapt.process import inputs_of, matern32
@@ -48,6 +57,12 @@ from sagesplat.scene.scene import Camera
 LEAST_SHARE = 1e-4  # of a cell in sight: it may be there though it was hidden in all known views
 MOST_FACTOR = 4.0  # of a share over what it would be unhidden
 _PRIOR = 1e-3  # weight of a factor's mean
+TERMS = 6  # cosines over the levels
+LEAST_MISSING = 0.025  # that a level's deviation is a part of
+# steps of positions over the extent, directions, log screens and log fields; of log distances; of values;
+# of factors
+STEP, LOG_STEP, VALUE_STEP, FACTOR_STEP = 1e-4, 0.02, 0.03, 0.05
+NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncertain by
 _STRICTER = np.array([0.1, 0.25])  # of screen and field: docs/developers/promises.md compares them
 _BOTH_STRICTER = -0.2
 
@@ -58,10 +73,11 @@ class CellModel:
 
     cell: LabelId
     offsets: Float[np.ndarray, " K"]  # mean of each level
+    places: Float[np.ndarray, " K"]  # t_k, of each level
     rows: Int[np.ndarray, " n"]  # views behind the process; none: the offsets are all there is
     log_distances: Float[np.ndarray, " n"]  # log of the cell's distance in them
     median_log_distance: Number  # where it is unknown
-    weights: Float[np.ndarray, "K n"]
+    values: Int[np.ndarray, "J n"]  # of the terms in them, in VALUE_STEP
     factors: Float[np.ndarray, " V"]  # v_ui of the module's text; -1: the view tells nothing
 
 
@@ -208,8 +224,21 @@ def cell_means(
         seen = np.isfinite(distance) & (distance > 0)
         log = np.where(seen, np.log(np.where(seen, distance, 1.0)), cell.median_log_distance)
         own = np.column_stack([model.views[cell.rows], cell.log_distances])
-        mean = mean + matern32(np.column_stack([known, log]), own, model.lengths) @ cell.weights.T
+        weights = cho_solve(cho_factor(covariance(own, model.lengths)), VALUE_STEP * cell.values.T)
+        terms = matern32(np.column_stack([known, log]), own, model.lengths) @ weights
+        mean = mean + terms @ shapes_of(cell.offsets, cell.places)
     return monotone(mean)
+
+
+def covariance(inputs: Float[np.ndarray, "n 9"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
+    """The kernel between all views, with the nugget."""
+    return matern32(inputs, inputs, lengths) + NUGGET * np.eye(len(inputs))
+
+
+def shapes_of(offsets: Float[np.ndarray, " K"], places: Float[np.ndarray, " K"]) -> Float[np.ndarray, "J K"]:
+    """By how much each term moves the levels: missing_k * cos(pi j t_k)."""
+    missing = np.where(offsets < 1, np.maximum(1 - offsets, LEAST_MISSING), 0)
+    return missing * np.cos(np.pi * np.arange(TERMS)[:, None] * places)
 
 
 def visible_factor(
@@ -286,12 +315,12 @@ def _check(model: FidelityModel) -> None:
         raise ValueError("a model of nothing")
     check_parts(model.calibration, model.screens, model.views, model.photos)
     for cell in model.cells:
-        K, n = cell.weights.shape
-        if (len(cell.rows), len(cell.log_distances)) != (n, n) or len(cell.factors) != V:
+        terms, n = cell.values.shape
+        if (len(cell.rows), len(cell.log_distances), terms) != (n, n, TERMS) or len(cell.factors) != V:
             raise ValueError("lists of unequal length")
-        if {K, len(cell.offsets)} != {len(model.levels)}:
+        if {len(cell.places), len(cell.offsets)} != {len(model.levels)}:
             raise ValueError("cells of unequal levels")
         if n and (cell.rows.min() < 0 or cell.rows.max() >= V):
             raise ValueError("views out of range")
-        numbers = cell.offsets, cell.log_distances, cell.weights, cell.factors
+        numbers = cell.offsets, cell.places, cell.log_distances, cell.values, cell.factors
         check_parts(NO_CALIBRATION, model.screens, *numbers)

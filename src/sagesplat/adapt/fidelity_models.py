@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
+from scipy.linalg import lstsq
 
 from sagesplat.adapt.calibrate import (
     AT_A_PHOTO,
@@ -28,12 +29,18 @@ from sagesplat.adapt.calibrate import (
     fewest_views,
 )
 from sagesplat.adapt.cell_models import (
+    FACTOR_STEP,
+    LOG_STEP,
+    STEP,
+    VALUE_STEP,
     CellModel,
     Expected,
     FidelityModel,
+    covariance,
     factors_of,
     needed,
     promised,
+    shapes_of,
     strictness_of,
     views_of,
 )
@@ -142,31 +149,32 @@ def _fit(
     sampled, sight = part.sampled, part.sight
     shares = sampled.shares()
     factors, average = factors_of(sight, shares), category.mean(0)
-    # a last level that is the full model is known, and no part of the process (unless it is the only one)
-    known = bool((category[:, -1] == 1).all())
-    learnt = slice(0, max(len(average) - known, 1))
+    places = (np.arange(len(average)) + 0.5) / len(average)
     seen = [np.flatnonzero(shares[:, column] >= CELL_SHARE) for column in part.columns]
-    inputs, offsets, rest, medians = [], [], [], []
+    inputs, offsets, terms, medians = [], [], [], []
     for column, own in zip(part.columns, seen, strict=True):
         values = sampled.fidelity[own, column].astype(np.float64)
         distance = sight.distance[own, column]
         logs = np.log(distance[distance > 0])
-        medians.append(float(np.median(logs)) if len(logs) else 0.0)
+        medians.append(round(float(np.median(logs)), 4) if len(logs) else 0.0)
         log = np.where(distance > 0, np.log(np.where(distance > 0, distance, 1.0)), medians[-1])
         inputs.append(np.column_stack([views[own], log]))
-        offsets.append((values.sum(0) + _TOWARDS * average) / (len(own) + _TOWARDS))
-        rest.append((values - offsets[-1])[:, learnt])
+        offsets.append(((values.sum(0) + _TOWARDS * average) / (len(own) + _TOWARDS)).round(4))
+        terms.append(terms_of(values, offsets[-1], places))
     induces = [np.isin(own, inducing) for own in seen]
-    process = fit_together(inputs, rest, induces)
+    process = fit_together(inputs, terms, induces)
+    known = np.round(views[inducing] / STEP) * STEP
     cells, left_out = [], np.full((*shares.shape, len(average)), np.nan)
     for i, (column, own, kept) in enumerate(zip(part.columns, seen, induces, strict=True)):
-        weights = np.zeros((kept.sum(), len(average)))
-        weights[:, learnt] = process.weights[i]
-        found = sampled.fidelity[own, column].astype(np.float64)
-        found[:, learnt] = offsets[i][learnt] + process.left_out[i]
-        left_out[own, column] = monotone(found)
-        log, row, v = inputs[i][kept, -1], np.searchsorted(inducing, own[kept]), factors[inducing, column]
-        cells.append(CellModel(part.ids[i], offsets[i], row, log, medians[i], weights.T, v))
+        shapes = shapes_of(offsets[i], places)
+        left_out[own, column] = monotone(offsets[i] + process.left_out[i] @ shapes)
+        rows_of_cell = np.searchsorted(inducing, own[kept])
+        logs = np.round(inputs[i][kept, -1] / LOG_STEP) * LOG_STEP
+        sent = np.column_stack([known[rows_of_cell], logs])
+        values = values_of(inputs[i][kept], sent, process.weights[i], process.lengths)
+        told = factors[inducing, column]
+        told = np.where(told < 0, -1, np.round(told / FACTOR_STEP) * FACTOR_STEP)
+        cells.append(CellModel(part.ids[i], offsets[i], places, rows_of_cell, logs, medians[i], values, told))
     # the category at equal levels, from its cells without the view
     weight = np.where(np.isnan(left_out[:, part.columns, 0]), 0, shares[:, part.columns])[rows]
     sums = np.einsum("vc,vck->vk", weight, np.nan_to_num(left_out[:, part.columns])[rows])
@@ -190,7 +198,7 @@ def _fit(
         extent=extent,
         focal=focal,
         screens=screens,
-        views=views[inducing],
+        views=known,
         lengths=process.lengths,
         photos=photos,
         cells=tuple(cells),
@@ -200,6 +208,32 @@ def _fit(
             _SPARSER * float(near[rows].max(1).min()), last,
         ),
     )  # fmt: skip
+
+
+def terms_of(
+    values: Float[np.ndarray, "n K"], offsets: Float[np.ndarray, " K"], places: Float[np.ndarray, " K"]
+) -> Float[np.ndarray, "n J"]:
+    """The terms that come closest to values of all levels, each deviation as a part of what is missing."""
+    shapes = shapes_of(offsets, places)
+    missing = shapes[:1]  # the first cosine is 1
+    moves = np.divide(shapes, missing, out=np.zeros(shapes.shape), where=missing > 0)
+    parts = np.divide(values - offsets, missing, out=np.zeros(values.shape), where=missing > 0)
+    return parts @ np.linalg.pinv(moves)
+
+
+def values_of(
+    own: Float[np.ndarray, "n 9"],
+    sent: Float[np.ndarray, "n 9"],
+    weights: Float[np.ndarray, "n J"],
+    lengths: tuple[float, float, float, float],
+) -> Int[np.ndarray, "J n"]:
+    """`CellModel.values`: with them a process of rounded inputs predicts in its own views what weights do."""
+    if not len(own):
+        return np.zeros((weights.shape[1], 0), int)
+    expected = matern32(own, own, lengths) @ weights
+    found = lstsq(matern32(own, sent, lengths), expected, cond=1e-9, lapack_driver="gelsy")
+    assert found is not None  # as its stub has it
+    return np.round((covariance(sent, lengths) @ found[0]).T / VALUE_STEP).astype(int)
 
 
 def photo_places(photos: Sequence[Camera], extent: float) -> Float[np.ndarray, "6 P"]:

@@ -6,6 +6,7 @@ generated. All are deterministic: they contain no times.
 """
 
 import hashlib
+from base64 import b64encode
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,7 +24,7 @@ from sagesplat.formats.increments import DIGITS, Increment, full_scene, palettes
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import frames
 from sagesplat.viewer.frames import FLIP
-from sagesplat.viewer.pack import ASPECT, FOV_Y, HEIGHT, Ladder, costs_of, order_of
+from sagesplat.viewer.pack import ASPECT, FOV_Y, HEIGHT, Ladder, order_of
 from sagesplat.viewer.promises import Seen, fidelity_document, of_cells, ssim_document
 from sagesplat.viewer.quality import (
     decimals_of,
@@ -146,10 +147,9 @@ def documents(
     entries: dict[QualityKind, dict[int, dict[str, Any]]] = {}
     promises: dict[QualityKind, bytes] = {}
     if models := contents.models:
-        cost = costs_of(contents.ladders())
         around = [*contents.drawn, *(entry.camera for entry in contents.cameras)]
         given = {c.label_id: c.fidelity for c in contents.categories if c.label_id in models and c.fidelity}
-        document = fidelity_document(given, contents.levels, contents.last, contents.shown, cost, around)
+        document = fidelity_document(given, contents.levels, contents.last, around)
         promises["fidelity"] = dumped(document)
         counts = {cell: len(levels) for cell, levels in contents.levels.items()}
         entries["fidelity"] = fidelity_entries(models, contents.shown, contents.drawn, counts)
@@ -275,7 +275,7 @@ def placed(cells: Cells, row: int) -> dict[str, Any]:
     return {
         "id": int(cells.ids[row]),
         "bounds": significant([*bounds.min(0), *bounds.max(0)]),
-        "points": (grid[used] if used.any() else grid[:1]).ravel().tolist(),
+        "points": b64encode((grid[used] if used.any() else grid[:1]).astype(np.uint8).tobytes()).decode(),
         "area": significant(cells.area[row]),
         "radius": significant(cells.radius[row], 4),
     }

@@ -1,15 +1,15 @@
 """promises-*.json: the viewpoint models of all categories for one quality, small enough to be sent.
 
-Fidelity has a model for each cell, whose categories are promised what compositions of the cells' levels keep:
-thresholds go up by as much as rounding changes the means of compositions. SSIM against photos has one model
-for each category.
+Fidelity has a model for each cell, in whole steps already as it was fitted and calibrated
+(`adapt.cell_models`). SSIM against photos has one model for each category, rounded here: thresholds go up by
+as much as that changes means.
 
-A mean over the viewpoint is written as its values at the model's views, not as weights. Weights cancel each
-other and need many digits; a value that is rounded moves the mean by about as much. A reader solves for them
+A process is written as its values at the model's views, not as weights. Weights cancel each other and need
+many digits; a value that is rounded moves the mean by about as much. A reader solves for them
 (`viewer.sent_model`). An offset holds what does not depend on the viewpoint: the mean of fidelity, and what
 views differ by that training never saw. Numbers are whole steps of a unit. The shared views, and the photos,
 are in the order of a path from each to the nearest one left, and lists over them hold differences to the one
-before: most are small. Values hold differences to the level below as well.
+before: most are small. Values of SSIM hold differences to the level below as well.
 """
 
 import math
@@ -22,9 +22,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import lstsq
 from scipy.spatial.distance import cdist
 
-from sagesplat.adapt.cell_models import CellModel, Expected, FidelityModel, expect
-from sagesplat.adapt.cells import Cells
-from sagesplat.adapt.fidelity_models import NOMINAL, plan_nominal
+from sagesplat.adapt.cell_models import FACTOR_STEP, LOG_STEP, STEP, CellModel, FidelityModel, covariance
 from sagesplat.adapt.process import matern32
 from sagesplat.adapt.viewpoint import Calibration, Prediction, QualityKind, ViewModel, where
 from sagesplat.scene.scene import Camera
@@ -32,20 +30,13 @@ from sagesplat.viewer.quality import curve_entry, significant
 from sagesplat.viewer.sent_model import (
     AXES,
     CORRECTION_STEP,
-    FACTOR_STEP,
-    STEP,
     STEPS_PER_UNIT,
-    covariance,
     model_of_entry,
-    read_fidelity,
 )
 
 MAX_ROUNDING_CHANGE = 5e-4  # of a mean, in any of the model's views and halfway to the next one; or
 RELATIVE_ROUNDING = 1e-2  # this part of what is missing to 1, if that is more
 MOST_VIEWS = 1024  # of a model; of more every second, third, ... is sent: a browser solves for the weights
-LOG_UNIT = 0.01  # of cells' log distances
-UNIT_OF_MISSING = 0.02  # units of a cell's values over what its mean misses to 1,
-VALUE_UNITS = (5e-4, 5e-3)  # within these
 # units of a label's log distances and values, the coarsest first
 _UNITS = ((1e-2, 1e-3), (5e-3, 7e-4), (5e-3, 5e-4), (2e-3, 5e-4), (1e-3, 3e-4), (5e-4, 1e-4), (1e-5, 1e-5))
 
@@ -100,8 +91,6 @@ def fidelity_document(
     models: Mapping[int, FidelityModel],
     files: Mapping[int, Sequence[int]],
     last: int,
-    cells: Cells,
-    cost: Int[np.ndarray, "C K"],
     cameras: Sequence[Camera],
 ) -> dict[str, Any]:
     """The document of fidelity, of at least one model.
@@ -110,18 +99,14 @@ def fidelity_document(
         models: By label id, with the ladder's levels; their views are the same.
         files: By cell id, the levels of its files; at least one each.
         last: The last of the nested levels.
-        cells: All of the bundle.
-        cost: Bytes of their levels (`costs_of`).
-        cameras: At least one viewpoint, where compositions' means are compared with what is sent of them.
+        cameras: At least one viewpoint: the widest lens that was tried.
     """
     some = next(iter(models.values()))
     order = _path(some.views)
-    place = np.argsort(order)
-    head, shared, _ = _head("fidelity", some, some.views[order])
-    views = shared / STEPS_PER_UNIT * AXES
-    entries: list[dict[str, Any]] = []
-    for label, model in models.items():
-        entry: dict[str, Any] = {
+    head, _, _ = _head("fidelity", some, some.views[order])
+    widest = max(min(camera.width, camera.height) / camera.focal for camera in cameras)
+    entries = [
+        {
             "id": label,
             "status": model.status,
             "confidence": model.confidence,
@@ -129,85 +114,33 @@ def fidelity_document(
             "lengths": significant(model.lengths),
             **_thresholds(model.calibration, 0.0),
             "cells": [
-                _cell(model, cell, levels_of_files(files[cell.cell], last), place, order, views)
+                _cell(cell, levels_of_files(files[cell.cell], last), order)
                 for cell in model.cells
                 if cell.cell in files
             ],
         }
-        entries.append(entry)
-    widest = max(min(camera.width, camera.height) / camera.focal for camera in cameras)
+        for label, model in models.items()
+    ]
     fov = math.floor(math.degrees(2 * math.atan(widest / 2)) + 0.5)
-    document = {**head, "fov": fov, "labels": entries}
-    kept = of_cells(models, files, last)
-    before, after = (expect(some, cells, cameras, cost.shape[1]) for some in (kept, read_fidelity(document)))
-    changes = _changes(kept, before, after, cost)
-    for entry in entries:
-        entry |= _thresholds(models[entry["id"]].calibration, changes[entry["id"]])
-    return document
+    return {**head, "fov": fov, "levels": len(some.levels), "labels": entries}
 
 
-def _changes(
-    models: Mapping[int, FidelityModel], before: Expected, after: Expected, cost: Int[np.ndarray, "C K"]
-) -> dict[int, float]:
-    """By label id, the largest change of what its compositions' bounds come from, over what is allowed.
-
-    Tried are all cells at one level, and the levels that reach targets.
-    """
-    V, C = before.share.shape
-    tried = [np.full((V, C), k + 1) for k in range(cost.shape[1])]
-    tried += list(plan_nominal(models, after, cost, NOMINAL).transpose(1, 0, 2))
-    worst = np.zeros(len(before.labels))
-    steepest = np.array(
-        [
-            np.abs(models[label].calibration.slopes).max(initial=0.0) if label in models else 0.0
-            for label in before.labels.tolist()
-        ]
-    )
-    away = np.abs(after.away - before.away)[:, None] * steepest
-    for levels in tried:
-        known, told = before.of_composition(levels), after.of_composition(levels)
-        losses = (1 - known) * before.strictness[:, None], (1 - told) * after.strictness[:, None]
-        change = (np.abs(losses[1] - losses[0]) + away) / allowed_change(known)
-        worst = np.maximum(worst, np.nan_to_num(change).max(0, initial=0.0))
-    return dict(zip(before.labels.tolist(), worst.tolist(), strict=True))
-
-
-def _cell(
-    model: FidelityModel,
-    cell: CellModel,
-    columns: Int[np.ndarray, " k"],
-    place: Int[np.ndarray, " V"],
-    order: Int[np.ndarray, " V"],
-    views: Float[np.ndarray, "V 8"],
-) -> dict[str, Any]:
-    """The entry of a cell; `place`: of each view among the shared ones `views`, `order` the reverse of it."""
-    by_place = np.argsort(place[cell.rows], kind="stable")
-    known = np.column_stack([model.views[cell.rows], cell.log_distances])
-    sent, weights = known[by_place], cell.weights.T[:, columns]
-    factors = np.where(cell.factors < 0, -1, np.round(cell.factors / FACTOR_STEP))[order]
-    entry = {
+def _cell(cell: CellModel, columns: Int[np.ndarray, " k"], order: Int[np.ndarray, " V"]) -> dict[str, Any]:
+    """The entry of a cell; `order`: of the views when they are sent."""
+    place = np.argsort(order)[cell.rows]
+    by_place = np.argsort(place)
+    logs = np.round(cell.log_distances[by_place] / LOG_STEP)
+    factors = np.where(cell.factors < 0, -1, np.round(cell.factors / FACTOR_STEP))
+    return {
         "id": cell.cell,
-        "levels": list(range(1, len(columns) + 1)),
-        "medianLogDistance": significant(cell.median_log_distance, 4),
-        "offsets": cell.offsets[columns].round(4).tolist(),
-        "views": _differences(place[cell.rows][by_place]),
-        "logDistances": {"unit": LOG_UNIT, "steps": []},
-        "values": {"units": [VALUE_UNITS[0]] * len(columns), "steps": [[] for _ in columns]},
-        "factors": _differences(factors),
+        "ladder": (columns + 1).tolist(),
+        "medianLogDistance": cell.median_log_distance,
+        "offsets": cell.offsets[columns].tolist(),
+        "views": _differences(place[by_place]),
+        "logDistances": {"unit": LOG_STEP, "steps": _differences(logs)},
+        "terms": cell.values[:, by_place].tolist(),
+        "factors": _differences(factors[order]),
     }
-    if not len(sent):
-        return entry
-    logs = np.round(sent[:, -1] / LOG_UNIT)
-    inputs = np.column_stack([views[place[cell.rows][by_place]], logs * LOG_UNIT])
-    expected = matern32(known, known, model.lengths) @ weights
-    found = lstsq(matern32(known, inputs, model.lengths), expected, cond=1e-9, lapack_driver="gelsy")
-    assert found is not None  # as its stub has it
-    values = covariance(inputs, model.lengths) @ found[0]
-    missing = 1 - (expected + cell.offsets[columns]).mean(0)
-    units = significant(np.clip(UNIT_OF_MISSING * missing, *VALUE_UNITS), 2)
-    entry["logDistances"]["steps"] = _differences(logs)
-    entry["values"] = {"units": units, "steps": _differences(np.round((values / units).T))}
-    return entry
 
 
 def levels_of_files(files: Sequence[int], last: int) -> Int[np.ndarray, " k"]:
@@ -227,7 +160,7 @@ def of_cells(
     def numbered(cell: CellModel) -> CellModel:
         columns = levels_of_files(files[cell.cell], last)
         columns = columns[np.minimum(np.arange(most), len(columns) - 1)]
-        return replace(cell, offsets=cell.offsets[columns], weights=cell.weights[columns])
+        return replace(cell, offsets=cell.offsets[columns], places=cell.places[columns])
 
     kept = {
         label: tuple(numbered(cell) for cell in model.cells if cell.cell in files)

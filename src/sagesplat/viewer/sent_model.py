@@ -1,12 +1,12 @@
 """Viewpoint models as promises-*.json holds them, and as a viewer evaluates them (`web/src/core/quality.ts`).
 
-The mean's weights are solved for, from the values at the model's views:
+Fidelity is read as the models of cells that were calibrated (`read_fidelity`), SSIM as one model a label
+(`read_model`), whose weights are solved for from the values at the model's views:
 
     (C + NUGGET I) weights = values,        C_ij = c(x_i, x_j), the kernel of `adapt.process`
     mean_k = curve_k(d) + offset_k + sum_i c(x, x_i) weights_ik
 
 Numbers are whole steps of a unit, lists over views hold differences to the view before (`viewer.promises`).
-Fidelity is read as models of cells (`read_fidelity`), SSIM as one model a label (`read_model`).
 """
 
 from collections.abc import Sequence
@@ -17,18 +17,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
-from sagesplat.adapt.cell_models import CellModel, FidelityModel
+from sagesplat.adapt.cell_models import FACTOR_STEP, STEP, CellModel, FidelityModel, covariance
 from sagesplat.adapt.eq3 import SsimModel
 from sagesplat.adapt.process import inputs_of, matern32
 from sagesplat.adapt.viewpoint import Calibration, Prediction, away_from, means_at, monotone
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.quality import curve_of
 
-NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncertain by
-STEP = 1e-4  # of the shared inputs (positions over the extent), shares, targets, thresholds and slopes
 AXES = np.array([*FLIP, *FLIP, 1.0, 1.0])  # signs of the shared inputs in the bundle's axes
 CORRECTION_STEP = 5e-3
-FACTOR_STEP = 0.05
 STEPS_PER_UNIT = round(1 / STEP)
 NEIGHBOUR_EXPONENT = 16  # of the kernel weights in `corrected`: only close views count
 HALF_WEIGHT = 1e-3  # weight at which a correction counts by half
@@ -122,7 +119,7 @@ def read_fidelity(document: dict[str, Any]) -> dict[int, FidelityModel]:
     """
     views = _steps(document["views"]) / STEPS_PER_UNIT * AXES
     photos = (_steps(document["photos"]) / STEPS_PER_UNIT * AXES[:6]).T
-    most = max(max(cell["levels"]) for entry in document["labels"] for cell in entry["cells"])
+    most = max(len(cell["ladder"]) for entry in document["labels"] for cell in entry["cells"])
     low, high = document["screens"]
     return {
         entry["id"]: FidelityModel(
@@ -133,7 +130,7 @@ def read_fidelity(document: dict[str, Any]) -> dict[int, FidelityModel]:
             views=views,
             lengths=_lengths(entry),
             photos=photos,
-            cells=tuple(_cell(cell, views, entry["lengths"], most) for cell in entry["cells"]),
+            cells=tuple(_cell(cell, views, document["levels"], most) for cell in entry["cells"]),
             rmse=0.0,
             calibration=calibration_of(entry),
         )
@@ -141,19 +138,18 @@ def read_fidelity(document: dict[str, Any]) -> dict[int, FidelityModel]:
     }
 
 
-def _cell(
-    cell: dict[str, Any], views: Float[np.ndarray, "U 8"], lengths: Sequence[float], levels: int
-) -> CellModel:
-    columns = np.minimum(np.arange(levels), len(cell["levels"]) - 1)
+def _cell(cell: dict[str, Any], views: Float[np.ndarray, "U 8"], last: int, most: int) -> CellModel:
+    """The model of a cell with `most` levels; `last`: of the ladder."""
+    columns = np.minimum(np.arange(most), len(cell["ladder"]) - 1)
     inputs, factors = _inputs(cell, views), np.cumsum(cell["factors"])
-    weights = _weights(cell, inputs, lengths) if len(inputs) else np.zeros((0, len(cell["levels"])))
     return CellModel(
         cell=cell["id"],
         offsets=np.array(cell["offsets"], np.float64)[columns],
+        places=(np.array(cell["ladder"])[columns] - 0.5) / last,
         rows=np.cumsum(np.array(cell["views"], int)),
         log_distances=inputs[:, -1],
         median_log_distance=cell["medianLogDistance"],
-        weights=weights.T[columns],
+        values=np.array(cell["terms"], int),
         factors=np.where(factors < 0, -1.0, factors * FACTOR_STEP),
     )
 
@@ -166,11 +162,6 @@ def calibration_of(entry: dict[str, Any]) -> Calibration:
     return Calibration(
         entry["status"], entry["confidence"], 0, targets, thresholds, slopes, entry["leastSupport"]
     )
-
-
-def covariance(inputs: Float[np.ndarray, "n 9"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
-    """The kernel between all views, with the nugget."""
-    return matern32(inputs, inputs, lengths) + NUGGET * np.eye(len(inputs))
 
 
 def _inputs(cell: dict[str, Any], views: Float[np.ndarray, "U 8"]) -> Float[np.ndarray, "n 9"]:

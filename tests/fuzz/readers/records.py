@@ -114,8 +114,8 @@ def _fidelity(folder: Path, size: int) -> list[bytes]:
     promise = json.loads(_promises(folder, 1)[0])["promises"][0]
     names = ("extent", "focal", "screens", "lengths", "photos", "rmse", "calibration")
     cell = {
-        "cell": 1, "offsets": [0.5, 1.0], "rows": [0, 1], "log_distances": [0.1, 0.2],
-        "median_log_distance": 0.1, "weights": [[0.1, 0.2], [0.0, 0.0]], "factors": [0.5, -1.0],
+        "cell": 1, "offsets": [0.5, 1.0], "places": [0.25, 0.75], "rows": [0, 1], "log_distances": [0.1, 0.2],
+        "median_log_distance": 0.1, "values": [[1, -2]] * 6, "factors": [0.5, -1.0],
     }  # fmt: skip
     entry = {name: promise[name] for name in names} | {"views": [[0.1] * 8, [0.2] * 8], "cells": [cell]}
     return as_json({"models": [entry | {"label_id": 2 + i} for i in range(size)]})

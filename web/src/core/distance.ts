@@ -34,12 +34,13 @@ export function rotate(q: Quat, v: Vec3): Vec3 {
 
 /** The points of a cell, and how far they are from the viewpoint that looked last. */
 export class Points {
-  private readonly rows: Float64Array; // [n, 4] x y z area
+  readonly rows: Float64Array; // [n, 4] x y z area
   private readonly radius: number;
   private readonly distances: Float64Array; // [n]
   private readonly weights: Float64Array; // [n] area in sight
 
-  constructor({ bounds, points, area, radius }: Cell) {
+  constructor({ bounds, points: packed, area, radius }: Cell) {
+    const points = Uint8Array.from(atob(packed), (byte) => byte.charCodeAt(0));
     const n = points.length / 4;
     this.radius = Math.max(radius, NEAREST);
     this.rows = new Float64Array(points.length);

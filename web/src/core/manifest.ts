@@ -97,7 +97,7 @@ function cellDefects({ levels, bounds, points }: Cell, path: string): string[] {
   if (bounds[0] > bounds[3] || bounds[1] > bounds[4] || bounds[2] > bounds[5]) {
     wrong.push(`${path}.bounds has a least above its most`);
   }
-  if (points.length % 4) wrong.push(`${path}.points must have four numbers a point`);
+  if (atob(points).length % 4) wrong.push(`${path}.points must have four bytes a point`);
   return wrong;
 }
 
@@ -167,6 +167,7 @@ export function parsePromises(json: string, file: string, quality: Quality): Pro
   refuse(even ? [] : ["views and photos must have columns of equal length"], file);
   const whole = found.labels.every(({ cells }) => cells.every(({ id }) => id < 0 === (quality === "ssim")));
   refuse(whole ? [] : ["labels have models of cells for fidelity, of the whole label for ssim"], file);
+  refuse(found.levels || quality === "ssim" ? [] : ["levels must say how many the ladder has"], file);
   refuse(found.quality === quality ? [] : [`quality must be ${JSON.stringify(quality)}`], file);
   refuse(
     found.screens[0] <= found.screens[1] ? [] : ["screens must be from the smaller to the larger"],
@@ -196,12 +197,14 @@ function modelDefects(one: LabelPromises, shared: number): string[] {
 }
 
 function cellModelDefects(one: CellPromises, shared: number): string[] {
-  const [n, K] = [one.views.length, one.levels.length];
-  const { factors = [], corrections = [], curves = [], shares = [] } = one;
+  const [n, K] = [one.views.length, one.offsets.length];
+  const { factors = [], corrections = [], curves = [], shares = [], levels, values, ladder, terms } = one;
   const has = (list: readonly number[], length: number) => list.length === length || !list.length;
   const fit =
-    [one.logDistances.steps, ...one.values.steps].every((values) => values.length === n) &&
-    [one.offsets, one.values.units, one.values.steps].every((values) => values.length === K) &&
+    [one.logDistances.steps, ...(terms ?? values?.steps ?? [])].every((row) => row.length === n) &&
+    (one.id < 0
+      ? [levels, values?.units, values?.steps].every((list) => list?.length === K)
+      : ladder?.length === K && terms !== undefined) &&
     (curves.length === K || !curves.length) &&
     has(factors, shared) &&
     has(shares, shared) &&
@@ -209,11 +212,14 @@ function cellModelDefects(one: CellPromises, shared: number): string[] {
     (total(one.views) < shared || !n);
   if (!fit) return [" has lists that do not fit together"];
   const wrong: string[] = [];
-  if (!isRising(one.levels)) wrong.push(".levels must rise");
+  if (!isRising(levels ?? ladder ?? [])) wrong.push(".levels must rise");
   if (!within(factors, 1e6) || !within(corrections, 1e5) || !within(shares, WHOLE))
     wrong.push(" has factors, shares or corrections out of range");
   const logs = one.logDistances;
-  if (!within(logs.steps, 100 / logs.unit) || one.values.steps.some((row) => !within(row, MOST))) {
+  if (
+    !within(logs.steps, 100 / logs.unit) ||
+    (values?.steps ?? terms ?? []).some((row) => !within(row, MOST))
+  ) {
     wrong.push(" has values out of range");
   }
   return wrong;

@@ -35,6 +35,8 @@ type From = Pick<Viewpoint, "position" | "direction" | "focal" | "lens">;
 const STEP = 1e-4;
 const CORRECTION_STEP = 5e-3;
 const FACTOR_STEP = 0.05;
+const VALUE_STEP = 0.03;
+const LEAST_MISSING = 0.025; // that a level's deviation is a part of
 const ROUNDED = 1e-9; // by which sums of the same means differ
 
 /** Eq. 3 at a distance, clamped to the fitted range; the median for an unknown distance (NaN). */
@@ -117,7 +119,10 @@ export class Views {
   fromPhotos = Number.NaN; // of the current viewpoint: 0 at a photo, 1 far from all; NaN: none are known
 
   constructor(
-    private readonly sent: Pick<Promises, "quality" | "views" | "photos" | "extent" | "focal" | "screens">,
+    private readonly sent: Pick<
+      Promises,
+      "quality" | "views" | "photos" | "extent" | "focal" | "screens" | "levels"
+    >,
   ) {
     this.rows = byRow(sent.views);
     this.photos = byRow(sent.photos);
@@ -131,6 +136,11 @@ export class Views {
       sum += logStrictness(this.rows[at + 6] as number, this.rows[at + 7] as number);
     }
     this.usual = sum / Math.max(count, 1);
+  }
+
+  /** Levels of the ladder that cells' levels are of. */
+  get levels(): number {
+    return this.sent.levels ?? 0;
   }
 
   /** Computes the differences from a viewpoint, once for all labels. */
@@ -192,7 +202,9 @@ const scalesOf = ({ lengths }: LabelPromises) =>
 
 /** The viewpoint model of a cell, or of a label as a whole; its weights are solved for when it is first in sight. */
 export class CellModel {
-  private weights: Float64Array | null = null; // [K, n]
+  private weights: Float64Array | null = null; // [J, n], of a cell's terms, or [K, n]
+  private readonly shapes: readonly Float64Array[]; // [J] of [K], by how much each term moves the levels
+  private readonly known: readonly number[]; // [K] levels with a prediction
   private readonly own: Int32Array; // [n] rows of the shared views
   private readonly logDistances: Float64Array; // [n]
   private readonly corrections: Float64Array; // [n]
@@ -205,6 +217,8 @@ export class CellModel {
     private readonly sent: CellPromises,
     private readonly scale: readonly [number, number, number, number],
   ) {
+    this.shapes = shapesOf(sent, views.levels);
+    this.known = sent.levels ?? sent.offsets.map((_, k) => k + 1);
     this.own = Int32Array.from(sums(sent.views, 1));
     this.logDistances = sums(sent.logDistances.steps, sent.logDistances.unit);
     this.corrections = sums(sent.corrections ?? [], CORRECTION_STEP);
@@ -221,15 +235,25 @@ export class CellModel {
   mean(distance: number): number[] {
     this.weights ??= this.solve();
     const { sent, weights } = this;
-    const n = this.own.length;
     const near = this.near(distance).map(matern);
-    const mean = sent.levels.map((_, level) => {
-      let moved = 0;
-      for (let i = 0, at = level * n; i < n; i++) moved += (near[i] as number) * (weights[at + i] as number);
-      const curve = sent.curves?.[level];
-      return (curve ? curveAt(curve, distance) : 0) + (sent.offsets[level] as number) + moved;
+    const n = near.length;
+    const moved = (row: number) => {
+      let sum = 0;
+      for (let i = 0, at = row * n; i < n; i++) sum += (near[i] as number) * (weights[at + i] as number);
+      return sum;
+    };
+    const mean = sent.offsets.map((offset, k) => {
+      if (sent.terms) return offset;
+      const curve = sent.curves?.[k];
+      return (curve ? curveAt(curve, distance) : 0) + offset + moved(k);
     });
-    return spread(rising(mean), sent.levels, this.levels);
+    this.shapes.forEach((shape, j) => {
+      const term = moved(j);
+      shape.forEach((by, k) => {
+        mean[k] = (mean[k] as number) + term * by;
+      });
+    });
+    return spread(rising(mean), this.known, this.levels);
   }
 
   /** 1 at one of its own views, 0 far from all of them; by all four inputs. */
@@ -332,7 +356,9 @@ export class LabelModel {
       own.id < 0 ? levelsOf(label) : (label.cells[i]?.levels.length ?? 0);
     return (
       models.length > 0 &&
-      models.every((own, i) => own.levels.every((level) => level <= most(own, i))) &&
+      models.every((own, i) =>
+        (own.levels ?? [own.offsets.length]).every((level) => level <= most(own, i)),
+      ) &&
       (models[0]?.id === -1 || models.length === label.cells.length)
     );
   }
@@ -383,8 +409,19 @@ function ownModels(label: Label, { cells }: LabelPromises): readonly CellPromise
 /** Levels of a label: of the cell that has most. */
 export const levelsOf = ({ cells }: Label): number => Math.max(0, ...cells.map((cell) => cell.levels.length));
 
-/** Values [K, n] from their differences along the views and to the level below. */
-function valuesOf({ values }: CellPromises): Float64Array {
+/** The terms of a cell's levels, [J] of [K]: cosines over the ladder, times what is missing. */
+function shapesOf({ terms = [], offsets, ladder = [] }: CellPromises, levels: number): Float64Array[] {
+  return terms.map((_, j) =>
+    Float64Array.from(offsets, (offset, k) => {
+      const missing = offset < 1 ? Math.max(1 - offset, LEAST_MISSING) : 0;
+      return missing * Math.cos((Math.PI * j * ((ladder[k] as number) - 0.5)) / levels);
+    }),
+  );
+}
+
+/** Values at the own views, by term or by level: those of levels are differences along both. */
+function valuesOf({ values, terms }: CellPromises): Float64Array {
+  if (!values) return Float64Array.from((terms ?? []).flat(), (steps) => steps * VALUE_STEP);
   const n = values.steps[0]?.length ?? 0;
   const out = new Float64Array(n * values.steps.length);
   const level = new Float64Array(n); // whole numbers, so the sums are exact

@@ -1,6 +1,7 @@
 /** Where a camera may go: not far from where the scene is known, and not through surfaces. */
 
 import { type Matrix4, Vector3 } from "three";
+import { Points } from "../core/distance";
 import type { Manifest, Promises, Vec3 } from "../types";
 import { vec3 } from "./frame";
 import { forward, type Rig } from "./motion";
@@ -30,15 +31,11 @@ export class Bounds {
     this.clearance = CLEARANCE * frame.extent * frame.metersPerUnit;
     this.viewpoints = [start, ...cameras].map(({ position }) => this.inWorld(position));
     this.surface = labels.flatMap(({ cells }) =>
-      cells.flatMap(({ bounds, points, area }) => {
-        const total = points.reduce((sum, value, i) => sum + (i % 4 === 3 ? value : 0), 0) || 1;
-        return Array.from({ length: points.length / 4 }, (_, i) => {
-          const place = [0, 1, 2].map((axis) => {
-            const [low = 0, high = 0] = [bounds[axis], bounds[axis + 3]];
-            return low + ((points[4 * i + axis] ?? 0) / 255) * (high - low);
-          }) as unknown as Vec3;
-          const part = (area * (points[4 * i + 3] ?? 0)) / total;
-          return { at: this.inWorld(place), radius: Math.sqrt(part / Math.PI) * frame.metersPerUnit };
+      cells.flatMap((cell) => {
+        const { rows } = new Points(cell);
+        return Array.from({ length: rows.length / 4 }, (_, i) => {
+          const [x = 0, y = 0, z = 0, area = 0] = rows.subarray(4 * i);
+          return { at: this.inWorld([x, y, z]), radius: Math.sqrt(area / Math.PI) * frame.metersPerUnit };
         });
       }),
     );

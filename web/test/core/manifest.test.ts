@@ -7,7 +7,7 @@ import { loadManifest, parseManifest, parsePromises, VERSION } from "../../src/c
 import { BundleError } from "../../src/core/schema";
 import type { Level, Manifest } from "../../src/types";
 import { Network, VirtualClock } from "../simulate";
-import { BASE, bundle } from "../worlds";
+import { BASE, base64, bundle } from "../worlds";
 
 type Json = Record<string, unknown>;
 const network = new Network(new VirtualClock());
@@ -142,8 +142,12 @@ test.each<[string, unknown, string, Manifest?]>([
   ["labels.0.cells", [], "labels[0].cells must be a list of at least 1"],
   ["labels.0.cells.0.bounds", [1, 0, 0, 0, 0, 0], "labels[0].cells[0].bounds has a least above its most"],
   ["labels.0.cells.0.bounds", [1, 0], "labels[0].cells[0].bounds must be a list of 6"],
-  ["labels.0.cells.0.points", [1, 2, 3, 4, 5], "labels[0].cells[0].points must have four numbers a point"],
-  ["labels.0.cells.0.points.0", 256, "labels[0].cells[0].points[0] must be a whole number from 0 to 255"],
+  [
+    "labels.0.cells.0.points",
+    base64([1, 2, 3, 4, 5]),
+    "labels[0].cells[0].points must have four bytes a point",
+  ],
+  ["labels.0.cells.0.points", "AAAA=", "labels[0].cells[0].points must be a list of bytes in base64"],
   ["labels.0.weight", -1, "labels[0].weight must be a number from 0 on"],
   ["labels.0.color", "red", "labels[0].color must be a colour as #rrggbb"],
   [`${LEVELS}.0.sha256`, "12", "labels[0].cells[0].levels[0].sha256 must be a SHA-256 in hexadecimal"],
@@ -223,6 +227,7 @@ test.each([
   ["focal", 0, "focal must be a number above 0"],
   ["screens", [1], "screens must be a list of 2"],
   ["screens", [2, 0.5], "screens must be from the smaller to the larger"],
+  ["levels", undefined, "levels must say how many"],
   ["views.0", [1], "views and photos must have columns of equal length"],
   ["views.0.1", 0.5, "views[0][1] must be a whole number"],
   ["labels.0.cells.0.factors", [5000], "labels[0].cells[0] has lists"],
@@ -231,11 +236,10 @@ test.each([
   ["labels.0.cells.0.id", -1, "labels have models of cells for fidelity, of the whole label for ssim"],
   ["labels.0.cells.0.views", [0, 99], "labels[0].cells[0] has lists"],
   ["labels.0.cells.0.views.1", 99, "labels[0].cells[0] has lists"],
-  ["labels.0.cells.0.values.steps", [], "labels[0].cells[0] has lists"],
-  ["labels.0.cells.0.values.steps.0", [1], "labels[0].cells[0] has lists"],
-  ["labels.0.cells.0.values.steps.0.0", 1e10, "labels[0].cells[0] has values out of range"],
-  ["labels.0.cells.0.values.units.0", 0, "labels[0].cells[0].values.units[0] must be a number from"],
-  ["labels.0.cells.0.values.units", [1], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.terms.0", [1], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.terms.0.0", 1e10, "labels[0].cells[0] has values out of range"],
+  ["labels.0.cells.0.ladder", [1], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.values", { units: [0], steps: [[]] }, "labels[0].cells[0].values.units[0] must be a"],
   ["labels.0.cells.0.offsets", [0], "labels[0].cells[0] has lists"],
   [
     "labels.0.cells.0.curves",

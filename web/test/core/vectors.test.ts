@@ -18,7 +18,7 @@ import { entriesOf } from "../../src/core/residency";
 import { familiesOf, ViewpointModels } from "../../src/core/viewpoints";
 import type { Cell, CellPromises, Curve, Label, LabelPromises, Promises, Viewpoint } from "../../src/types";
 import { Network, VirtualClock } from "../simulate";
-import { at, bundle, differences, frustumOf, modelsOf } from "../worlds";
+import { at, base64, bundle, differences, frustumOf, modelsOf } from "../worlds";
 
 /** Null: NaN, or of a focal length, the photos'. */
 type Maybe = number | null;
@@ -83,7 +83,13 @@ const levelled = (place: Place, count: number): Cell => ({
   ...place,
   levels: Array.from({ length: count }, () => level),
 });
-const somewhere: Place = { id: 0, bounds: [0, 0, 0, 1, 1, 1], points: [0, 0, 0, 1], area: 1, radius: 1 };
+const somewhere: Place = {
+  id: 0,
+  bounds: [0, 0, 0, 1, 1, 1],
+  points: base64([0, 0, 0, 1]),
+  area: 1,
+  radius: 1,
+};
 const labelOf = (id: number, cells: readonly Cell[]): Label => ({
   id,
   name: "label",
@@ -180,7 +186,7 @@ describe("points", () => {
   const cell: Cell = {
     id: 0,
     bounds: [1, 0, -2, 3, 0, -2],
-    points: [0, 0, 0, 50, 255, 0, 0, 150],
+    points: base64([0, 0, 0, 50, 255, 0, 0, 150]),
     area: 4,
     radius: 0.5,
     levels: [level],
@@ -217,7 +223,10 @@ describe("points", () => {
 
   test("where there are none, or of no area, nothing is in sight", () => {
     for (const points of [[], [1, 2, 3, 0]]) {
-      expect(new Points({ ...cell, points }).look(view)).toMatchObject({ visible: false, potential: 0 });
+      expect(new Points({ ...cell, points: base64(points) }).look(view)).toMatchObject({
+        visible: false,
+        potential: 0,
+      });
     }
     const here = new Points({ ...cell, bounds: [0, 0, 0, 0, 0, 0], radius: 0 }).look(view);
     expect(here.apparent).toBeLessThan(Infinity);
@@ -270,7 +279,7 @@ describe("models", () => {
       ...own,
       views: [],
       logDistances: { unit: 0.01, steps: [] },
-      values: { units: own.values.units, steps: own.levels.map(() => []) },
+      terms: [],
     });
     const all = {
       ...sent,

@@ -6,7 +6,7 @@ import type { Manifest, Promises, Vec3 } from "../../src/types";
 import { Bounds } from "../../src/view/bounds";
 import { dolly, type Rig, walk } from "../../src/view/motion";
 import { Network, VirtualClock } from "../simulate";
-import { bundle } from "../worlds";
+import { base64, bundle } from "../worlds";
 
 const IDENTITY = new Matrix4();
 const at = (position: Vec3, reach = 4): Rig => ({ position, yaw: 0, pitch: 0, roll: 0, reach }); // looks along -z
@@ -17,7 +17,12 @@ function made(known = true): Bounds {
   const [label] = plain.labels;
   const [cell] = label?.cells ?? [];
   if (!label || !cell) throw new Error("no cell");
-  const wall = { ...cell, bounds: [-1, -1, -4, 1, 1, -4] as const, points: [128, 128, 0, 255], area: 0 };
+  const wall = {
+    ...cell,
+    bounds: [-1, -1, -4, 1, 1, -4] as const,
+    points: base64([128, 128, 0, 255]),
+    area: 0,
+  };
   const manifest: Manifest = {
     ...plain,
     frame: { ...plain.frame, extent: 10, metersPerUnit: 1 },

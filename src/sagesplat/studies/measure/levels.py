@@ -114,7 +114,7 @@ class _BundleLevel:
     count: AtLeast1
     bytes: AtLeast1
     gpuBytes: AtLeast1
-    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{16,64}\Z")]
+    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{12,64}\Z")]
     refine: Refine = "ADD"
     offset: Count | None = None
     weight: Share | None = None
