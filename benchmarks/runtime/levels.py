@@ -1,6 +1,7 @@
 """Our rows: equal levels, and what the planner takes for each frame within a budget or for a target."""
 
 import gzip
+import json
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -138,8 +139,10 @@ def planned(
 
 
 def index_bytes(job: Job) -> int:
-    """What a viewer of ours reads before it plans, compressed as servers do: manifest and models."""
+    """What our viewer reads before it plans for fidelity, compressed as servers do: manifest and models."""
     with tempfile.TemporaryDirectory() as work:
         out = bundle(job, Path(work) / "bundle").path
-        files = [out / "manifest.json", *out.glob("promises-*.json")]
+        manifest = out / "manifest.json"
+        models = json.loads(manifest.read_text())["promises"]["fidelity"]["uri"]
+        files = [manifest, out / models]
         return sum(len(gzip.compress(file.read_bytes())) for file in files)

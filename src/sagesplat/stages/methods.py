@@ -265,11 +265,17 @@ class NestedLevels(Method):
                 i: thinned(plans[i], sampled.fidelity, pixels, self.cell_costs, label_of, search.asked)
                 for i, search in searches.items()
             }
+            # nothing is gained by a plan that takes as much as one that holds
+            least = {i: plan.transfer_bytes or 0 for i, plan in found.items()}
+            for i in [i for i in least.keys() & tried if (tried[i].transfer_bytes or 0) >= least[i]]:
+                del tried[i], searches[i]
+            if not tried:
+                break
             measured = self._in_composition(list(tried.values()), cameras)
             for j, (i, plan) in enumerate(tried.items()):
                 plan, over = measured_in_composition(plan, measured[:, j], proven=False)
                 held = min(over.values(), default=0.0) >= 0
-                if held and (i not in found or (plan.transfer_bytes or 0) < (found[i].transfer_bytes or 0)):
+                if held:  # takes less than the last one that did
                     found[i] = plan
                 if not searches[i].narrow(plan, over):
                     del searches[i]
