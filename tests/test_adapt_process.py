@@ -67,10 +67,21 @@ def test_where_all_views_stay_it_is_the_process_itself():
 
 def through(inputs: list, values: list, stay: list) -> tuple[tuple, float]:
     """What `fit_together` finds, and the noise of the views that stay."""
-    found = fit_together(inputs, values, stay)
+    found = fit_together(inputs, values, stay, [np.eye(v.shape[1]) for v in values])
     (own, own_values), *_ = [(x[some], v[some]) for x, v, some in zip(inputs, values, stay, strict=True)]
     noise = fit_process(own, np.zeros(len(own), bool), own_values).noise
     return (found.lengths, found.weights, found.left_out), noise
+
+
+def test_terms_that_move_nothing_have_no_say_in_the_lengths():
+    x, _, values = drawn()
+    here, first = np.ones(20, bool), values[:, :1]
+    noise = np.random.default_rng(3).normal(size=(20, 1))
+    alone = fit_together([x], [first], [here], [np.eye(1)])
+    both = fit_together([x], [np.hstack([first, noise])], [here], [np.array([[1.0], [0.0]])])
+    np.testing.assert_allclose(both.lengths, alone.lengths)
+    np.testing.assert_allclose(both.weights[0][:, :1], alone.weights[0])
+    assert both.weights[0].shape == (20, 2)
 
 
 def test_slopes_of_the_covariance():

@@ -151,7 +151,7 @@ def _fit(
     factors, average = factors_of(sight, shares), category.mean(0)
     places = (np.arange(len(average)) + 0.5) / len(average)
     seen = [np.flatnonzero(shares[:, column] >= CELL_SHARE) for column in part.columns]
-    inputs, offsets, terms, medians = [], [], [], []
+    inputs, offsets, shapes, terms, medians = [], [], [], [], []
     for column, own in zip(part.columns, seen, strict=True):
         values = sampled.fidelity[own, column].astype(np.float64)
         distance = sight.distance[own, column]
@@ -160,14 +160,14 @@ def _fit(
         log = np.where(distance > 0, np.log(np.where(distance > 0, distance, 1.0)), medians[-1])
         inputs.append(np.column_stack([views[own], log]))
         offsets.append(((values.sum(0) + _TOWARDS * average) / (len(own) + _TOWARDS)).round(4))
-        terms.append(terms_of(values, offsets[-1], places))
+        shapes.append(shapes_of(offsets[-1], places))
+        terms.append(terms_of(values - offsets[-1], shapes[-1]))
     induces = [np.isin(own, inducing) for own in seen]
-    process = fit_together(inputs, terms, induces)
+    process = fit_together(inputs, terms, induces, shapes)
     known = np.round(views[inducing] / STEP) * STEP
     cells, left_out = [], np.full((*shares.shape, len(average)), np.nan)
     for i, (column, own, kept) in enumerate(zip(part.columns, seen, induces, strict=True)):
-        shapes = shapes_of(offsets[i], places)
-        left_out[own, column] = monotone(offsets[i] + process.left_out[i] @ shapes)
+        left_out[own, column] = monotone(offsets[i] + process.left_out[i] @ shapes[i])
         rows_of_cell = np.searchsorted(inducing, own[kept])
         logs = np.round(inputs[i][kept, -1] / LOG_STEP) * LOG_STEP
         sent = np.column_stack([known[rows_of_cell], logs])
@@ -211,13 +211,13 @@ def _fit(
 
 
 def terms_of(
-    values: Float[np.ndarray, "n K"], offsets: Float[np.ndarray, " K"], places: Float[np.ndarray, " K"]
+    deviations: Float[np.ndarray, "n K"], shapes: Float[np.ndarray, "J K"]
 ) -> Float[np.ndarray, "n J"]:
-    """The terms that come closest to values of all levels, each deviation as a part of what is missing."""
-    shapes = shapes_of(offsets, places)
+    """The terms that come closest to deviations of all levels, each as a part of what is missing."""
     missing = shapes[:1]  # the first cosine is 1
-    moves = np.divide(shapes, missing, out=np.zeros(shapes.shape), where=missing > 0)
-    parts = np.divide(values - offsets, missing, out=np.zeros(values.shape), where=missing > 0)
+    moves, parts = (
+        np.divide(of, missing, out=np.zeros(of.shape), where=missing > 0) for of in (shapes, deviations)
+    )
     return parts @ np.linalg.pinv(moves)
 
 

@@ -83,8 +83,8 @@ class Together:
     """Processes with the same hyperparameters; weights and views left out of each, as of `Process`."""
 
     lengths: tuple[float, float, float, float]
-    weights: list[Float[np.ndarray, "_ K"]]  # of the inducing views
-    left_out: list[Float[np.ndarray, "_ K"]]
+    weights: list[Float[np.ndarray, "_ J"]]  # of the inducing views
+    left_out: list[Float[np.ndarray, "_ J"]]
 
 
 def fit_process(
@@ -110,15 +110,23 @@ def fit_process(
 
 def fit_together(
     inputs: Sequence[Float[np.ndarray, "_ 8"]],
-    values: Sequence[Float[np.ndarray, "_ K"]],
+    values: Sequence[Float[np.ndarray, "_ J"]],
     inducing: Sequence[Bool[np.ndarray, " _"]],
+    shapes: Sequence[Float[np.ndarray, "J K"]],
 ) -> Together:
     """Fit processes of zero mean that differ in their values alone, each at n >= 0 viewpoints.
 
-    `inducing`: which views stay in the models; the hyperparameters are those of these.
+    Args:
+        inputs: Of the viewpoints of each.
+        values: What is learnt of each.
+        inducing: Which views stay in the models; the hyperparameters are those of these.
+        shapes: What the values mean: the hyperparameters are those of `values @ shapes`, where small terms
+            count as little as they move what they stand for.
     """
     all_parts = [
-        (x[some], v[some]) for x, v, some in zip(inputs, values, inducing, strict=True) if some.any()
+        (x[some], v[some] @ shape)
+        for x, v, some, shape in zip(inputs, values, inducing, shapes, strict=True)
+        if some.any()
     ]
     theta = _hyperparameters([(_squares(x), np.zeros(len(x), bool), v) for x, v in all_parts])
     solved = [_solved_through(x, v, some, theta) for x, v, some in zip(inputs, values, inducing, strict=True)]

@@ -167,13 +167,14 @@ def _write(
     lit_world(seed, places)  # cached here, before threads use it
 
     def take(i: int) -> Shot:
-        return _take_shot(cameras[i], rows[i], seed, places, wild, gains[rows[i]])
+        shot = _take_shot(cameras[i], rows[i], seed, places, wild, gains[rows[i]])
+        Image.fromarray(shot.photo).save(folder / "images" / names[i])
+        Image.fromarray(shot.label).save(folder / "masks" / names[i])
+        return shot
 
     shots = []
     for i, shot in enumerate(threads_map(take, range(len(cameras)))):
         shots.append(shot)
-        Image.fromarray(shot.photo).save(folder / "images" / names[i])
-        Image.fromarray(shot.label).save(folder / "masks" / names[i])
         if on_view:
             on_view(i + 1, len(cameras))
     if places == (1, 1):
@@ -222,9 +223,13 @@ def _write_objects(
 ) -> None:
     """Number of the object at each pixel, in the photos as they were taken: none where a figure stands."""
     folder.mkdir()
-    for name, camera, shot in zip(names, cameras, shots, strict=True):
-        objects = np.where(shot.hidden, NO_OBJECT, _render_objects(camera, seed))
-        Image.fromarray(objects.astype(np.uint16)).save(folder / name)
+
+    def write(i: int) -> None:
+        objects = np.where(shots[i].hidden, NO_OBJECT, _render_objects(cameras[i], seed))
+        Image.fromarray(objects.astype(np.uint16)).save(folder / names[i])
+
+    for _ in threads_map(write, range(len(names))):
+        pass
 
 
 def _render_objects(camera: Camera, seed: int) -> Int16[np.ndarray, "H W"]:
