@@ -19,16 +19,14 @@ from sagesplat.demo.foliage import NO_OBJECT
 from sagesplat.demo.off_path import off_path_pictures, write_pictures, write_transforms
 from sagesplat.demo.points import Taken, write_points
 from sagesplat.demo.render import (
-    FAR,
-    camera_rays,
-    cast_rays,
+    Lit,
     lit_world,
     render_light,
     take_photo,
     threads_map,
 )
 from sagesplat.demo.wild import FACING, NOTHING, Wild, camera_gains, kept_views, lens_falloff, noisy_cameras
-from sagesplat.demo.world import BRICK, CORE, LABELS, LEAF, ROOF, WOOD
+from sagesplat.demo.world import BRICK, CORE, LABELS, LEAF, ROOF, WOOD, World
 from sagesplat.io.files import cache_folder, unwritable, write_json
 from sagesplat.scene.scene import Camera
 
@@ -39,6 +37,7 @@ class Shot(NamedTuple):
     photo: UInt8[np.ndarray, "H W 3"]
     label: UInt8[np.ndarray, "H W"]  # with the figures, where label images show them
     hidden: Bool[np.ndarray, "H W"]  # where a figure stands
+    objects: Int16[np.ndarray, "H W"]  # number of the object; NO_OBJECT for none, and behind figures
     true_photo: UInt8[np.ndarray, "H W 3"]
     true_label: UInt8[np.ndarray, "H W"]
     depth: Float32[np.ndarray, "H W"]  # of the scene without figures
@@ -162,7 +161,8 @@ def _write(
     digits = max(3, len(str(len(cameras) - 1)))
     gains, rows = camera_gains(wild, len(cameras), seed), kept_views(wild, len(cameras), seed)
     names, cameras = [f"view_{i:0{digits}d}.png" for i in rows], [cameras[i] for i in rows]
-    for below in ("images", "masks", "sparse/0"):
+    one = places == (1, 1)  # whose objects are numbered
+    for below in ("images", "masks", "sparse/0", *["instances"] * one):
         (folder / below).mkdir(parents=True)
     lit_world(seed, places)  # cached here, before threads use it
 
@@ -170,6 +170,8 @@ def _write(
         shot = _take_shot(cameras[i], rows[i], seed, places, wild, gains[rows[i]])
         Image.fromarray(shot.photo).save(folder / "images" / names[i])
         Image.fromarray(shot.label).save(folder / "masks" / names[i])
+        if one:
+            Image.fromarray(shot.objects.astype(np.uint16)).save(folder / "instances" / names[i])
         return shot
 
     shots = []
@@ -177,8 +179,6 @@ def _write(
         shots.append(shot)
         if on_view:
             on_view(i + 1, len(cameras))
-    if places == (1, 1):
-        _write_objects(folder / "instances", names, cameras, shots, seed)
     people = {PERSON: "person"} if wild.figures and wild.figure_masks else {}
     write_taxonomy(folder, people | LABELS)
     photos, labels = np.stack([s.true_photo for s in shots]), np.stack([s.true_label for s in shots])
@@ -203,48 +203,32 @@ def _take_shot(
     Light is disturbed before the tone curve, as in a camera, and the sensor's noise is that of the
     undisturbed photo.
     """
-    light, true_label, depth = render_light(camera, seed, places)
-    true_photo, true_label = take_photo(light, camera, seed), true_label.astype(np.uint8)
+    lit = render_light(camera, seed, places)
+    light, objects = lit.rgb, _objects(lit_world(seed, places), lit)
+    true_photo, true_label = take_photo(light, camera, seed), lit.label.astype(np.uint8)
     label = true_label
     hidden = np.zeros(label.shape, bool)
     if wild.quiet:
-        return Shot(true_photo, label, hidden, true_photo, true_label, depth)
+        return Shot(true_photo, label, hidden, objects, true_photo, true_label, lit.depth)
     if wild.figures:
         figures = figures_at(number, camera.position, wild.figures, seed)
-        light, with_figures, _ = render_light(camera, seed, places, figures)
-        hidden = with_figures == PERSON
-        label = with_figures.astype(np.uint8) if wild.figure_masks else true_label
+        with_figures = render_light(camera, seed, places, figures)
+        light, hidden = with_figures.rgb, with_figures.label == PERSON
+        label = with_figures.label.astype(np.uint8) if wild.figure_masks else true_label
     photo = take_photo(light * gains * lens_falloff(wild, camera), camera, seed)
-    return Shot(photo, label, hidden, true_photo, true_label, depth)
+    objects = np.where(hidden, NO_OBJECT, objects).astype(np.int16)
+    return Shot(photo, label, hidden, objects, true_photo, true_label, lit.depth)
 
 
-def _write_objects(
-    folder: Path, names: list[str], cameras: list[Camera], shots: list[Shot], seed: int
-) -> None:
-    """Number of the object at each pixel, in the photos as they were taken: none where a figure stands."""
-    folder.mkdir()
-
-    def write(i: int) -> None:
-        objects = np.where(shots[i].hidden, NO_OBJECT, _render_objects(cameras[i], seed))
-        Image.fromarray(objects.astype(np.uint16)).save(folder / names[i])
-
-    for _ in threads_map(write, range(len(names))):
-        pass
-
-
-def _render_objects(camera: Camera, seed: int) -> Int16[np.ndarray, "H W"]:
-    """The object of `build_world` at each pixel's centre, NO_OBJECT where there is none."""
-    world = lit_world(seed, (1, 1))
-    v, u = (np.indices((camera.height, camera.width)) + 0.5).reshape(2, -1)
-    origins, directions, _ = camera_rays(camera, np.stack([u, v], 1))
-    _, material, part = cast_rays(world, origins, directions, FAR, float(1 / camera.K[0, 0]))
-    found = np.full(len(part), NO_OBJECT, np.int16)
-    bodies, leaves = np.isin(material, (BRICK, ROOF, CORE)), material == LEAF
-    solids = (material >= WOOD) & ~bodies & ~leaves
-    found[leaves] = world.leaf_object[part[leaves]]
-    found[bodies] = world.body_object[part[bodies] // 8]
-    found[solids] = world.solid_object[part[solids]]
-    return found.reshape(camera.height, camera.width)
+def _objects(world: World, lit: Lit) -> Int16[np.ndarray, "H W"]:
+    """The object of `build_world` at each pixel, NO_OBJECT where there is none."""
+    found = np.full(lit.part.shape, NO_OBJECT, np.int16)
+    bodies, leaves = np.isin(lit.material, (BRICK, ROOF, CORE)), lit.material == LEAF
+    solids = (lit.material >= WOOD) & ~bodies & ~leaves
+    found[leaves] = world.leaf_object[lit.part[leaves]]
+    found[bodies] = world.body_object[lit.part[bodies] // 8]
+    found[solids] = world.solid_object[lit.part[solids]]
+    return found
 
 
 def _write_truth(

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from typing import NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -21,6 +22,16 @@ HORIZON = 20.0  # metres; nothing farther away casts a shadow
 SENSOR_NOISE = 1.0  # standard deviation, 8-bit steps
 FIGURE = LEAF + 1  # material of `figures.Figures`
 NEEDS_RAY = 3  # materials from this one on, except leaves, cast a shadow ray
+
+
+class Lit(NamedTuple):
+    """What reaches a camera; all but the colour are those of the ray through the pixel's centre."""
+
+    rgb: Float64[np.ndarray, "H W 3"]  # linear
+    label: Int16[np.ndarray, "H W"]
+    depth: Float32[np.ndarray, "H W"]  # camera z in metres, inf in the sky
+    material: Int64[np.ndarray, "H W"]
+    part: Int64[np.ndarray, "H W"]  # of `raycast.trace`
 
 
 @lru_cache(maxsize=1)
@@ -45,17 +56,14 @@ def render_view(
     Label and depth are those of the ray through the pixel's centre. The clouds are on a dome of 80 m radius.
     The sensor noise depends on seed and pose, so a view always gives the same photo.
     """
-    light, label, depth = render_light(camera, seed)
-    return take_photo(light, camera, seed), label, depth
+    lit = render_light(camera, seed)
+    return take_photo(lit.rgb, camera, seed), lit.label, lit.depth
 
 
 def render_light(
     camera: Camera, seed: int = 0, places: tuple[int, int] = (1, 1), figures: Figures | None = None
-) -> tuple[Float64[np.ndarray, "H W 3"], Int16[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """Linear RGB that reaches a camera, with labels and depths as `render_view` gives them.
-
-    `figures` stand in the scene, without shadows.
-    """
+) -> Lit:
+    """What reaches a camera. `figures` stand in the scene, without shadows."""
     world, shape = lit_world(seed, places), (camera.height, camera.width)
     pixel = float(1 / camera.K[0, 0])
     v, u = (np.indices(shape) + 0.5).reshape(2, -1)
@@ -72,7 +80,7 @@ def render_light(
         offset = 0.38 * np.array([np.cos(2.1 * k), np.sin(2.1 * k)])
         rgb[rough] += _sample(world, camera, uv[rough] + offset, pixel, k, figures)[1]
     rgb[rough] /= 4
-    return rgb.reshape(*shape, 3), label.reshape(shape), depth.reshape(shape)
+    return Lit(rgb.reshape(*shape, 3), *(of.reshape(shape) for of in (label, depth, material, part)))
 
 
 def take_photo(light: Float64[np.ndarray, "H W 3"], camera: Camera, seed: int) -> UInt8[np.ndarray, "H W 3"]:

@@ -12,6 +12,7 @@ from sagesplat.core.config import (
     NestConfig,
     PlanConfig,
     RunConfig,
+    SampleConfig,
     TrainConfig,
 )
 from sagesplat.core.errors import RunError
@@ -43,6 +44,8 @@ from sagesplat.stages.scene import check_not_adopted, open_scene
 DEMO = RunConfig(
     train=TrainConfig(max_steps=1200, level_every=60),
     nest=NestConfig(steps=600, levels=12, base_steps=250),
+    # twice as many as so short a training has: plans for a view take 8 % fewer bytes
+    sample=SampleConfig(views=100, calibration_views=92),
     plan=PlanConfig(target_fidelity=0.9),
 )
 WILD_DEMO = replace(
