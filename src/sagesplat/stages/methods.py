@@ -55,8 +55,8 @@ from sagesplat.stages.snapshots import Snapshots
 from sagesplat.stages.viewpoints import fit_viewpoints
 
 _RAISES = 6  # times that a plan is measured in its composition, and its failing levels raised
-# At so many viewpoints at most: four plans of garden take 16 s with 128, 12 s with 80, and 9 to 1 % more bytes
-# then; of dinosaur 18 and 12 s, and 5 % more to 2 % fewer.
+# At so many viewpoints at most: four plans of garden take 16 s with 128, and 12 s with 80 but 1 to 9 % more
+# bytes; of dinosaur 18 and 12 s, and from 2 % fewer to 5 % more.
 _VIEWPOINTS = 96
 
 
