@@ -18,9 +18,9 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
     strictness = exp(0.25 f + 0.1 s - 0.2 f s)                              logs of field and screen; over
                                                                             that of the known views
 
-So what is missing to the full model, over what is missing on average, is a few cosines over the levels. Six
-leave 5 % of it, less than a tenth of what a cell is uncertain by, and are half as much to send as the levels.
-Numbers are whole steps of units: a viewer has the same ones (`viewer.promises`).
+So what is missing to the full model, over what is missing on average, is a few cosines over the levels: views
+differ by 0.35 of it, of which six leave 0.05 (docs/developers/promises.md). Numbers are whole steps of units:
+a viewer has the same ones (`viewer.promises`).
 
 A target is kept where the mean reaches what is needed. Through wide lenses and on fine screens compositions
 measure less than their means more often, and thresholds are found over all of them: hence the strictness. A
@@ -38,7 +38,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
 from sagesplat.adapt.cells import Cells, Sight, look
-from sagesplat.adapt.process import inputs_of, matern32
+from sagesplat.adapt.process import covariance, inputs_of, matern32
 from sagesplat.adapt.viewpoint import (
     NO_CALIBRATION,
     PHOTO_LENGTHS,
@@ -62,7 +62,6 @@ LEAST_MISSING = 0.025  # that a level's deviation is a part of
 # steps of positions over the extent, directions, log screens and log fields; of log distances; of values;
 # of factors
 STEP, LOG_STEP, VALUE_STEP, FACTOR_STEP = 1e-4, 0.02, 0.03, 0.05
-NUGGET = 1e-3  # added to the kernel's diagonal: far below what a mean is uncertain by
 _STRICTER = np.array([0.1, 0.25])  # of screen and field: docs/developers/promises.md compares them
 _BOTH_STRICTER = -0.2
 
@@ -228,11 +227,6 @@ def cell_means(
         terms = matern32(np.column_stack([known, log]), own, model.lengths) @ weights
         mean = mean + terms @ shapes_of(cell.offsets, cell.places)
     return monotone(mean)
-
-
-def covariance(inputs: Float[np.ndarray, "n 9"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
-    """The kernel between all views, with the nugget."""
-    return matern32(inputs, inputs, lengths) + NUGGET * np.eye(len(inputs))
 
 
 def shapes_of(offsets: Float[np.ndarray, " K"], places: Float[np.ndarray, " K"]) -> Float[np.ndarray, "J K"]:

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
-from scipy.linalg import lstsq
 
 from sagesplat.adapt.calibrate import (
     AT_A_PHOTO,
@@ -36,7 +35,6 @@ from sagesplat.adapt.cell_models import (
     CellModel,
     Expected,
     FidelityModel,
-    covariance,
     factors_of,
     needed,
     promised,
@@ -47,7 +45,7 @@ from sagesplat.adapt.cell_models import (
 from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.cells import Cells, Sight, look
 from sagesplat.adapt.fidelity import SampledFidelity
-from sagesplat.adapt.process import fit_together, matern32
+from sagesplat.adapt.process import fit_together, matern32, values_at
 from sagesplat.adapt.viewpoint import PHOTO_LENGTHS, Calibration, Status, away_from, monotone, where
 from sagesplat.scene.scene import Camera
 
@@ -171,7 +169,8 @@ def _fit(
         rows_of_cell = np.searchsorted(inducing, own[kept])
         logs = np.round(inputs[i][kept, -1] / LOG_STEP) * LOG_STEP
         sent = np.column_stack([known[rows_of_cell], logs])
-        values = values_of(inputs[i][kept], sent, process.weights[i], process.lengths)
+        values = values_at(sent, inputs[i][kept], process.weights[i], process.lengths)
+        values = np.round(values.T / VALUE_STEP).astype(int)
         told = factors[inducing, column]
         told = np.where(told < 0, -1, np.round(told / FACTOR_STEP) * FACTOR_STEP)
         cells.append(CellModel(part.ids[i], offsets[i], places, rows_of_cell, logs, medians[i], values, told))
@@ -219,21 +218,6 @@ def terms_of(
         np.divide(of, missing, out=np.zeros(of.shape), where=missing > 0) for of in (shapes, deviations)
     )
     return parts @ np.linalg.pinv(moves)
-
-
-def values_of(
-    own: Float[np.ndarray, "n 9"],
-    sent: Float[np.ndarray, "n 9"],
-    weights: Float[np.ndarray, "n J"],
-    lengths: tuple[float, float, float, float],
-) -> Int[np.ndarray, "J n"]:
-    """`CellModel.values`: with them a process of rounded inputs predicts in its own views what weights do."""
-    if not len(own):
-        return np.zeros((weights.shape[1], 0), int)
-    expected = matern32(own, own, lengths) @ weights
-    found = lstsq(matern32(own, sent, lengths), expected, cond=1e-9, lapack_driver="gelsy")
-    assert found is not None  # as its stub has it
-    return np.round((covariance(sent, lengths) @ found[0]).T / VALUE_STEP).astype(int)
 
 
 def photo_places(photos: Sequence[Camera], extent: float) -> Float[np.ndarray, "6 P"]:

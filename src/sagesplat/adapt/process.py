@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, cholesky, lstsq, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
@@ -38,6 +38,7 @@ GROUPS = (slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 9))
 PRIOR = np.log([0.3, 0.5, 1.0, 0.5, 0.1, 0.1])
 PRIOR_WIDTH = np.array([0.7, 0.7, 0.7, 0.7, 1.5, 1.5])
 PRIOR_REACH = 3.0
+NUGGET = 1e-3  # on the diagonal of a process that is sent: far below what a mean is uncertain by
 _JITTER = 1e-8  # on the diagonal of C_mm: far below any noise
 FEW = 0.1  # what values are uncertain by if seen in one view; falls as 1 / views
 
@@ -76,6 +77,29 @@ def matern32(
     scale = np.repeat(lengths, [group.stop - group.start for group in GROUPS[: len(lengths)]])
     scaled_distance = np.sqrt(3) * cdist(a / scale, b / scale)
     return (1 + scaled_distance) * np.exp(-scaled_distance)
+
+
+def covariance(inputs: Float[np.ndarray, "n 9"], lengths: Sequence[float]) -> Float[np.ndarray, "n n"]:
+    """The kernel between all views, with the nugget."""
+    return matern32(inputs, inputs, lengths) + NUGGET * np.eye(len(inputs))
+
+
+def values_at(
+    sent: Float[np.ndarray, "m 9"],
+    own: Float[np.ndarray, "n 9"],
+    weights: Float[np.ndarray, "n K"],
+    lengths: Sequence[float],
+) -> Float[np.ndarray, "m K"]:
+    """Values at rounded inputs, by which a process predicts in its own views what these weights do.
+
+    A reader solves `covariance(sent) weights = values`.
+    """
+    if not len(own):
+        return np.zeros((len(sent), weights.shape[1]))
+    expected = matern32(own, own, lengths) @ weights
+    found = lstsq(matern32(own, sent, lengths), expected, cond=1e-9, lapack_driver="gelsy")
+    assert found is not None  # as its stub has it
+    return covariance(sent, lengths) @ found[0]
 
 
 @dataclass(frozen=True, eq=False)

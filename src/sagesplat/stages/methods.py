@@ -1,5 +1,6 @@
 """Ours, and which method a run has: stages and studies ask `method_of`, and never which of the two it is."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -260,23 +261,23 @@ class NestedLevels(Method):
             for i, plan in enumerate(plans)
             if plan.quality == "fidelity" and share < 1
         }
+        least = dict.fromkeys(searches, math.inf)  # bytes of what holds
         while searches:
             tried = {
                 i: thinned(plans[i], sampled.fidelity, pixels, self.cell_costs, label_of, search.asked)
                 for i, search in searches.items()
             }
             # nothing is gained by a plan that takes as much as one that holds
-            least = {i: plan.transfer_bytes or 0 for i, plan in found.items()}
-            for i in [i for i in least.keys() & tried if (tried[i].transfer_bytes or 0) >= least[i]]:
-                del tried[i], searches[i]
+            tried = {i: plan for i, plan in tried.items() if (plan.transfer_bytes or 0) < least[i]}
+            searches = {i: searches[i] for i in tried}
             if not tried:
                 break
             measured = self._in_composition(list(tried.values()), cameras)
             for j, (i, plan) in enumerate(tried.items()):
                 plan, over = measured_in_composition(plan, measured[:, j], proven=False)
                 held = min(over.values(), default=0.0) >= 0
-                if held:  # takes less than the last one that did
-                    found[i] = plan
+                if held:
+                    found[i], least[i] = plan, plan.transfer_bytes or 0
                 if not searches[i].narrow(plan, over):
                     del searches[i]
         return found

@@ -19,11 +19,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import lstsq
 from scipy.spatial.distance import cdist
 
-from sagesplat.adapt.cell_models import FACTOR_STEP, LOG_STEP, STEP, CellModel, FidelityModel, covariance
-from sagesplat.adapt.process import matern32
+from sagesplat.adapt.cell_models import FACTOR_STEP, LOG_STEP, STEP, CellModel, FidelityModel
+from sagesplat.adapt.process import values_at
 from sagesplat.adapt.viewpoint import Calibration, Prediction, QualityKind, ViewModel, where
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer.quality import curve_entry, significant
@@ -250,10 +249,7 @@ def _with_values(
     logs = np.round(own[some, -1] / log_unit)
     views = shared[np.cumsum(whole["views"])] / STEPS_PER_UNIT * AXES
     inputs = np.column_stack([views, logs * log_unit])
-    expected = matern32(own, own, model.lengths) @ model.weights
-    found = lstsq(matern32(own, inputs, model.lengths), expected, cond=1e-9, lapack_driver="gelsy")
-    assert found is not None  # as its stub has it
-    values = covariance(inputs, model.lengths) @ found[0]
+    values = values_at(inputs, own, model.weights, model.lengths)
     return {
         **whole,
         "logDistances": {"unit": log_unit, "steps": _differences(logs)},

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
-from sagesplat.adapt.cell_models import FACTOR_STEP, STEP, CellModel, FidelityModel, covariance
+from sagesplat.adapt.cell_models import FACTOR_STEP, STEP, CellModel, FidelityModel
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.process import inputs_of, matern32
+from sagesplat.adapt.process import covariance, inputs_of, matern32
 from sagesplat.adapt.viewpoint import Calibration, Prediction, away_from, means_at, monotone
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.quality import curve_of

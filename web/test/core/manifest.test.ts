@@ -263,6 +263,26 @@ test.each([
   expect(complaint(() => parsed(changed(promises, path, value)))).toContain(message);
 });
 
+const { ladder: _, terms: __, ...cell } = promises.labels[0].cells[0];
+const K = cell.offsets.length;
+const values = { units: Array(K).fill(1e-3), steps: Array(K).fill(cell.views) };
+const whole = { ...cell, id: -1, levels: cell.offsets.map((_: number, k: number) => k + 1), values };
+const ssim = { ...promises, quality: "ssim", labels: [{ ...promises.labels[0], cells: [whole] }] };
+
+test.each([
+  ["values.steps", [], "labels[0].cells[0] has lists"],
+  ["values.steps.0", [1], "labels[0].cells[0] has lists"],
+  ["values.steps.0.0", 1e10, "labels[0].cells[0] has values out of range"],
+  ["values.units.0", 0, "labels[0].cells[0].values.units[0] must be a number from"],
+  ["values.units", [1], "labels[0].cells[0] has lists"],
+  ["values", undefined, "labels[0].cells[0] has lists"],
+  ["levels", [1, 2, 3, 4, 5], "labels[0].cells[0] has lists"],
+])("promises of ssim: %s = %j", (path, value, message) => {
+  const parsed = (json: string) => parsePromises(json, "p.json", "ssim");
+  expect(parsed(JSON.stringify(ssim))).toEqual(ssim);
+  expect(complaint(() => parsed(changed(ssim, `labels.0.cells.0.${path}`, value)))).toContain(message);
+});
+
 describe("loading", () => {
   const load = async (prepare: (network: Network) => void) => {
     const clock = new VirtualClock();
