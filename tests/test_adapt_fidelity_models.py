@@ -125,10 +125,10 @@ def test_on_the_path_and_off_it_each_keeps_its_targets():
         away = expect(models, CELLS, fresh, K).away
         measured = by_category(truth(fresh, planned_at(models, fresh, 0.9), 9000 + seed, right=right))
         got = measured[:, 0] >= 0.9
-        kept.append([got[side].mean() for side in (away < 0.3, away >= 0.3)])
+        kept.append([got[side].mean() for side in (away < 0.15, away >= 0.15)])
     near, far = np.mean(kept, 0)
     assert far > 0.93
-    assert near < 0.99  # one threshold for both keeps all of these
+    assert near < 0.995  # one threshold for both keeps all of these
 
 
 @pytest.mark.parametrize("confidence", [0.9, 0.95])
@@ -208,6 +208,22 @@ def test_viewpoints_off_the_path_that_need_more_get_more():
     assert at_photo == pytest.approx(same, abs=0.01)  # too few on the path to tell
 
 
+def test_on_the_path_a_fifth_fewer_misses_are_allowed():
+    """The same misses on the path and off it: of 60 viewpoints the second largest and the third count."""
+    models, _ = made(0)
+    before = replace(models[3].calibration, slopes=0 * models[3].calibration.slopes)
+    away = np.repeat([0.0, 0.6], 60)
+    bound = np.broadcast_to(NOMINAL[None, :, None], (120, len(NOMINAL), 1)).copy()
+    short = np.tile(np.arange(60) / 1000, 2)
+    fidelity = (bound - short[:, None, None]).astype(np.float32)
+    ones = np.ones((120, 1))
+    found = Trial([3], ones > 0, ones, away, bound, np.full((120, len(NOMINAL) - 1, 1), 1000), fidelity)
+    (model,) = calibrated({3: replace(models[3], calibration=before)}, found, 0.95).values()
+    for place, missing in ((away[:1], 0.058), (away[-1:], 0.057)):
+        asked = before.needed(0.8 + missing, place)
+        np.testing.assert_allclose(model.calibration.needed(0.8, place), asked, atol=3e-4)
+
+
 def test_a_category_without_a_model_takes_no_promise_from_the_others():
     models, _ = made(0)
     cameras = viewpoints(20, 4)
@@ -243,7 +259,7 @@ def test_wide_lenses_and_fine_screens_ask_for_more():
     screens, fields = np.log([[1, 1, 2], [1, 2, 1]]) + np.log(
         [[1.0], [np.sqrt(camera.width * camera.height)]]
     )
-    asked = np.exp(0.25 * fields + 0.1 * screens - 0.2 * fields * screens)
+    asked = np.exp(0.15 * fields + 0.05 * screens - 0.2 * fields * screens)
     np.testing.assert_allclose(allowed * asked[:, None], np.repeat(allowed[:1], 3, 0) * asked[0])
 
 

@@ -15,7 +15,7 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
     mean     = sum_u share_u mean_u,level(u) / sum_u share_u                of the category's composition
     needed   = 1 - (1 - threshold - slope * away) / strictness              of a target (`adapt.viewpoint`),
                at most the mean of all cells' last levels                   up to the last target
-    strictness = exp(0.25 f + 0.1 s - 0.2 f s)                              logs of field and screen; over
+    strictness = exp(0.15 f + 0.05 s - 0.2 f s)                             logs of field and screen; over
                                                                             that of the known views
 
 So what is missing to the full model, over what is missing on average, is a few cosines over the levels: views
@@ -62,7 +62,7 @@ LEAST_MISSING = 0.025  # that a level's deviation is a part of
 # steps of positions over the extent, directions, log screens and log fields; of log distances; of values;
 # of factors
 STEP, LOG_STEP, VALUE_STEP, FACTOR_STEP = 1e-4, 0.02, 0.03, 0.05
-_STRICTER = np.array([0.1, 0.25])  # of screen and field: docs/developers/promises.md compares them
+_STRICTER = np.array([0.05, 0.15])  # of screen and field: docs/developers/promises.md compares them
 _BOTH_STRICTER = -0.2
 
 

@@ -72,9 +72,9 @@ _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more 
 # distribution is often a little sparser where they lie far apart: on the built-in capture 8 % of decisions of
 # those walking and 14 % of those stepping back had no promise with 1, 2 % and 6 % have none with this.
 _SPARSER = 0.7
-_NEAR = 0.3  # `Expected.away` of viewpoints that count as on the capture's path
-# Of the share of decisions that may miss: on some screens and through some lenses more do than of all
-# viewpoints, and each kind is to keep its share (docs/developers/promises.md).
+_NEAR = 0.15  # `Expected.away` of viewpoints that count as on the capture's path
+# Of the share of decisions that may miss on the capture's path: on some screens and through some lenses more
+# do than of all viewpoints, and each kind is to keep its share (docs/developers/promises.md).
 _OF_MISSES = 0.8
 _FEW = 10  # viewpoints on it, and off it, from which on both are looked at
 
@@ -442,7 +442,8 @@ def calibrated(
         others = np.hstack([np.zeros((len(TARGETS), 0)), *of_others])
         rows = list(zip(decisions[label].at(kind), others, strict=True))
         values = np.full(len(TARGETS), np.inf)
-        for share in (stricter, confidence):  # from too few viewpoints, as strict as promised
+        # off the path, and from too few viewpoints, as strict as promised
+        for share in (confidence,) if kind is False else (stricter, confidence):
             if np.isinf(values).any():
                 values = np.array([conformal_quantile(own, share, other) for own, other in rows])
         return np.where(held, np.maximum(values, TARGETS), values)

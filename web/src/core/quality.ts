@@ -99,7 +99,7 @@ const HALF_WEIGHT = 1e-3;
 
 const COLUMNS = 8; // of the shared views: position over the extent, direction, log screen, log field
 const PHOTO_COLUMNS = 6; // of the photos: position and direction
-const [STRICTER_SCREEN, STRICTER_FIELD, STRICTER_BOTH] = [0.1, 0.25, -0.2] as const; // of logs of screen and field
+const [STRICTER_SCREEN, STRICTER_FIELD, STRICTER_BOTH] = [0.05, 0.15, -0.2] as const; // of logs of screen and field
 const PLACE_LENGTHS = [0.3, 0.5] as const; // of position and direction, for photos and factors
 
 function logStrictness(screen: number, field: number): number {
