@@ -30,6 +30,7 @@ viewpoint's support is the kernel by position, direction and screen to the neare
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
@@ -100,6 +101,19 @@ class FidelityModel:
     def levels(self) -> tuple[int, ...]:
         """The levels that it predicts, ascending."""
         return tuple(range(1, len(self.cells[0].offsets) + 1))
+
+    def inputs_of(self, cell: CellModel) -> Float[np.ndarray, "n 9"]:
+        """The inputs of the views behind a cell's process."""
+        return np.column_stack([self.views[cell.rows], cell.log_distances])
+
+    @cached_property
+    def weights(self) -> tuple[np.ndarray, ...]:
+        """The weights of each cell's n views, from its values in them: [n, J]."""
+        factors = (cho_factor(covariance(self.inputs_of(cell), self.lengths)) for cell in self.cells)
+        return tuple(
+            cho_solve(factor, VALUE_STEP * cell.values.T)
+            for factor, cell in zip(factors, self.cells, strict=True)
+        )
 
     @property
     def num_views(self) -> int:
@@ -182,9 +196,9 @@ def expect(
         strictness = strictness_of(known, model.views)
         support[:, np.searchsorted(labels, label)] = matern32(known, model.views, model.lengths[:3]).max(1)
         near = matern32(known[:, :6], model.views[:, :6], PHOTO_LENGTHS)
-        for cell in model.cells:
+        for cell, weights in zip(model.cells, model.weights, strict=True):
             i = place[cell.cell]
-            of_levels = cell_means(model, cell, known, sight.distance[:, i])
+            of_levels = cell_means(model, cell, weights, known, sight.distance[:, i])
             mean[:, i] = of_levels[:, np.minimum(np.arange(levels), of_levels.shape[1] - 1)]
             factor[:, i] = visible_factor(near, cell.factors)
     share = sight.apparent * factor
@@ -214,6 +228,7 @@ def strictness_of(
 def cell_means(
     model: FidelityModel,
     cell: CellModel,
+    weights: Float[np.ndarray, "n J"],
     known: Float[np.ndarray, "V 8"],
     distance: Float[np.ndarray, " V"],
 ) -> Float[np.ndarray, "V K"]:
@@ -222,9 +237,7 @@ def cell_means(
     if len(cell.rows):
         seen = np.isfinite(distance) & (distance > 0)
         log = np.where(seen, np.log(np.where(seen, distance, 1.0)), cell.median_log_distance)
-        own = np.column_stack([model.views[cell.rows], cell.log_distances])
-        weights = cho_solve(cho_factor(covariance(own, model.lengths)), VALUE_STEP * cell.values.T)
-        terms = matern32(np.column_stack([known, log]), own, model.lengths) @ weights
+        terms = matern32(np.column_stack([known, log]), model.inputs_of(cell), model.lengths) @ weights
         mean = mean + terms @ shapes_of(cell.offsets, cell.places)
     return monotone(mean)
 
