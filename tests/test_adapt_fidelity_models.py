@@ -246,6 +246,23 @@ def test_a_promise_is_the_largest_target_whose_needs_are_met():
         np.testing.assert_array_equal((composed >= least)[known], (found >= target - 1e-9)[known])
 
 
+def test_wide_lenses_and_fine_screens_ask_for_more():
+    models, _ = made(0)
+    models = {
+        label: replace(model, calibration=replace(model.calibration, least_support=0.0))
+        for label, model in models.items()
+    }
+    (camera,) = viewpoints(1, 4)
+    wide = replace(camera, width=2 * camera.width, height=2 * camera.height)
+    fine = replace(wide, K=camera.K * np.array([[2], [2], [1]], np.float32))  # the same lens
+    allowed = 1 - needed(models, expect(models, CELLS, [camera, wide, fine], K), 0.8)
+    screens, fields = np.log([[1, 1, 2], [1, 2, 1]]) + np.log(
+        [[1.0], [np.sqrt(camera.width * camera.height)]]
+    )
+    asked = np.exp(0.15 * fields + 0.05 * screens - 0.2 * fields * screens)
+    np.testing.assert_allclose(allowed * asked[:, None], np.repeat(allowed[:1], 3, 0) * asked[0])
+
+
 def test_shares_are_those_that_were_seen():
     """Half of what a cell would cover is hidden: the factors know."""
     cameras = viewpoints(60, 6)

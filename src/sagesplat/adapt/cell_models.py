@@ -13,15 +13,19 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
     factor_u = (sum_i k_i v_ui + 0.001 v_u) / (sum_i k_i + 0.001)           k_i: by position and direction
                v_ui: true share over `apparent` in view i, what others leave of the cell; v_u: their mean
     mean     = sum_u share_u mean_u,level(u) / sum_u share_u                of the category's composition
-    needed   = threshold + slope * away                                     of a target (`adapt.viewpoint`),
+    needed   = 1 - (1 - threshold - slope * away) / strictness              of a target (`adapt.viewpoint`),
                at most the mean of all cells' last levels                   up to the last target
+    strictness = exp(0.15 f + 0.05 s - 0.2 f s)                             logs of field and screen; over
+                                                                            that of the known views
 
 So what is missing to the full model, over what is missing on average, is a few cosines over the levels: views
 differ by 0.35 of it, of which six leave 0.05 (docs/developers/promises.md). Numbers are whole steps of units:
 a viewer has the same ones (`viewer.promises`).
 
-A target is kept where the mean reaches what is needed. A viewpoint's support is the kernel by position,
-direction and screen to the nearest known view; below `least_support` nothing is promised.
+A target is kept where the mean reaches what is needed. Through wide lenses and on fine screens compositions
+measure less than their means more often, and thresholds are found over all of them: hence the strictness. A
+viewpoint's support is the kernel by position, direction and screen to the nearest known view; below
+`least_support` nothing is promised.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,6 +63,8 @@ LEAST_MISSING = 0.025  # that a level's deviation is a part of
 # steps of positions over the extent, directions, log screens and log fields; of log distances; of values;
 # of factors
 STEP, LOG_STEP, VALUE_STEP, FACTOR_STEP = 1e-4, 0.02, 0.03, 0.05
+_STRICTER = np.array([0.05, 0.15])  # of screen and field: docs/developers/promises.md compares them
+_BOTH_STRICTER = -0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,11 +143,12 @@ class Expected:
     distance: Float[np.ndarray, "V C"]  # world units; NaN: out of sight
     support: Float[np.ndarray, "V L"]  # NaN without a model
     away: Float[np.ndarray, " V"]  # 0 at a photo, 1 far from all
+    strictness: Float[np.ndarray, " V"]  # divides the loss that thresholds allow
 
     def at(self, view: int) -> "Expected":
         """What is expected from one of the viewpoints."""
         one = slice(view, view + 1)
-        of_views = ("mean", "share", "distance", "support", "away")
+        of_views = ("mean", "share", "distance", "support", "away", "strictness")
         arrays = {name: getattr(self, name)[one] for name in of_views}
         return replace(self, **arrays)
 
@@ -181,11 +188,12 @@ def expect(
     shape = len(cameras), len(cells.ids)
     mean, factor = np.full((*shape, levels), np.nan), np.ones(shape)
     support = np.full((len(cameras), len(labels)), np.nan)
-    away = np.zeros(len(cameras))
+    away, strictness = np.zeros(len(cameras)), np.ones(len(cameras))
     place = {cell: i for i, cell in enumerate(cells.ids.tolist())}
     for label, model in models.items():
         known = views_of(cameras, model.extent, model.focal, model.screens)
         away = 1 - matern32(known[:, :6], model.photos.T, PHOTO_LENGTHS).max(1)
+        strictness = strictness_of(known, model.views)
         support[:, np.searchsorted(labels, label)] = matern32(known, model.views, model.lengths[:3]).max(1)
         near = matern32(known[:, :6], model.views[:, :6], PHOTO_LENGTHS)
         for cell, weights in zip(model.cells, model.weights, strict=True):
@@ -196,7 +204,7 @@ def expect(
     share = sight.apparent * factor
     share /= np.maximum(share.sum(1, keepdims=True), 1)
     share = np.where(sight.apparent > 0, np.maximum(share, LEAST_SHARE), 0)
-    return Expected(cells.ids, labels, column, mean, share, sight.distance, support, away)
+    return Expected(cells.ids, labels, column, mean, share, sight.distance, support, away, strictness)
 
 
 def views_of(
@@ -207,6 +215,14 @@ def views_of(
     field = np.sqrt([camera.width * camera.height / camera.focal**2 for camera in cameras])
     screen = np.clip(screen, *screens)
     return inputs_of(np.ones(len(cameras)), position, direction, extent, 0.0, screen, field)[:, :-1]
+
+
+def strictness_of(
+    views: Float[np.ndarray, "V 8"], known: Float[np.ndarray, "N 8"]
+) -> Float[np.ndarray, " V"]:
+    """What divides the loss that thresholds allow, of viewpoints (`views_of`); `known`: those of a model."""
+    here, usual = (of[:, 6:] @ _STRICTER + _BOTH_STRICTER * of[:, 6] * of[:, 7] for of in (views, known))
+    return np.exp(here - usual.mean())
 
 
 def cell_means(
@@ -259,8 +275,9 @@ def promised(
         if label in models:
             calibration = models[label].calibration
             found[:, column] = calibration.bound(
-                composed[:, [column]], expected.support[:, column], expected.away, last[:, column]
-            )[:, 0]
+                composed[:, [column]], expected.support[:, column], expected.away, expected.strictness,
+                last[:, column],
+            )[:, 0]  # fmt: skip
     return found
 
 
@@ -273,7 +290,7 @@ def needed(
         if label in models:
             calibration, support = models[label].calibration, expected.support[:, column]
             least = support >= calibration.least_support
-            asked = calibration.needed(target, expected.away, last[:, column])
+            asked = calibration.needed(target, expected.away, expected.strictness, last[:, column])
             found[:, column] = np.where(least, asked, np.nan)
     return found
 

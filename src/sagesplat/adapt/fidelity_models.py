@@ -39,6 +39,7 @@ from sagesplat.adapt.cell_models import (
     needed,
     promised,
     shapes_of,
+    strictness_of,
     views_of,
 )
 from sagesplat.adapt.cell_plans import reach
@@ -181,9 +182,10 @@ def _fit(
     near = matern32(views, views[inducing], process.lengths[:3])
     near[inducing, np.arange(len(inducing))] = 0
     scale = AT_A_PHOTO + away_from(views[rows], photos, near[rows].max(1))
+    told = 1 - (1 - without) * strictness_of(views[rows], views[inducing])[:, None]
     margins = np.clip(
         [
-            np.quantile(critical_margins(without, category, target, scale), confidence, method="higher")
+            np.quantile(critical_margins(told, category, target, scale), confidence, method="higher")
             for target in TARGETS
         ],
         *_MARGINS,

@@ -13,6 +13,7 @@ evaluates the same formulas (`web/src/core/quality.ts`):
                                                     SSIM against photos it is 1 - support
     bound_k = the largest target whose threshold, this far away, mean_k reaches
               threshold = threshold_target + slope_target * away, at least those of lower targets, at most 1;
+              of fidelity 1 - (1 - that) / strictness, for the lens and screen (`adapt.cell_models`)
 
 `adapt.calibrate` finds, for each target, the threshold: the mean from which on a level keeps the target, at a
 confidence. Between targets it is interpolated. The slopes are for errors that grow away from the photos: what
@@ -77,17 +78,18 @@ class Calibration:
         mean: Float[np.ndarray, "V K"],
         support: Float[np.ndarray, " V"],
         away: Float[np.ndarray, " V"] | None = None,
+        strictness: Float[np.ndarray, " V"] | float = 1.0,
         most: Float[np.ndarray, " V"] | float = np.inf,
     ) -> Float[np.ndarray, "V K"]:
         """The largest target that each mean keeps; below the first target the same distance from the mean.
 
-        NaN without any target, and where the support is too small. `away`: None: 1 - support. `most`: the
-        mean that keeps all targets, however far away.
+        NaN without any target, and where the support is too small. `away`: None: 1 - support. `strictness`
+        divides the loss that thresholds allow. `most`: the mean that keeps all targets, however far away.
         """
         away = 1 - support if away is None else away
         if not len(self.targets):
             return np.full(mean.shape, np.nan)
-        needed = self._needed(away, most)
+        needed = self._needed(away, strictness, most)
         found = np.array(
             [np.interp(m, n, self.targets) for m, n in zip(mean, needed, strict=True)], np.float64
         ).reshape(mean.shape)
@@ -100,6 +102,7 @@ class Calibration:
         self,
         target: float,
         away: Float[np.ndarray, " V"],
+        strictness: Float[np.ndarray, " V"] | float = 1.0,
         most: Float[np.ndarray, " V"] | float = np.inf,
     ) -> Float[np.ndarray, " V"]:
         """The mean from which on a target is kept (arguments: `bound`); inf: no level keeps it.
@@ -108,17 +111,19 @@ class Calibration:
         """
         if not len(self.targets):
             return np.full(len(away), np.nan)
-        known = self._needed(away, most)
+        known = self._needed(away, strictness, most)
         found = np.array([np.interp(target, self.targets, row, right=np.inf) for row in known])
         return np.where(target < self.targets[0], known[:, 0] - (self.targets[0] - target), found)
 
     def _needed(
         self,
         away: Float[np.ndarray, " V"],
+        strictness: Float[np.ndarray, " V"] | float,
         most: Float[np.ndarray, " V"] | float,
     ) -> Float[np.ndarray, "V G"]:
         """The mean that each of the targets needs."""
         found = np.minimum(np.maximum.accumulate(self.thresholds + np.outer(away, self.slopes), 1), 1)
+        found = 1 - (1 - found) / np.reshape(strictness, (-1, 1))
         return np.fmin(found, np.reshape(most, (-1, 1)) - _ROUNDED)
 
 

@@ -99,7 +99,12 @@ const HALF_WEIGHT = 1e-3;
 
 const COLUMNS = 8; // of the shared views: position over the extent, direction, log screen, log field
 const PHOTO_COLUMNS = 6; // of the photos: position and direction
+const [STRICTER_SCREEN, STRICTER_FIELD, STRICTER_BOTH] = [0.05, 0.15, -0.2] as const; // of logs of screen and field
 const PLACE_LENGTHS = [0.3, 0.5] as const; // of position and direction, for photos and factors
+
+function logStrictness(screen: number, field: number): number {
+  return STRICTER_SCREEN * screen + STRICTER_FIELD * field + STRICTER_BOTH * screen * field;
+}
 
 /** The views that the models of all labels share, and how far they are from the current viewpoint. */
 export class Views {
@@ -109,6 +114,8 @@ export class Views {
   readonly alike: Float64Array; // [V] of place: 1 at the view
   readonly rows: Float64Array; // [V, COLUMNS]
   private readonly photos: Float64Array; // [P, PHOTO_COLUMNS]
+  strictness = 1; // of screen and lens: divides the loss that thresholds allow
+  private readonly usual: number; // log of the strictness, mean over the views
   fromPhotos = Number.NaN; // of the current viewpoint: 0 at a photo, 1 far from all; NaN: none are known
 
   constructor(
@@ -124,6 +131,11 @@ export class Views {
     this.turned = new Float64Array(count);
     this.rescaled = new Float64Array(count);
     this.alike = new Float64Array(count);
+    let sum = 0;
+    for (let at = 0; at < this.rows.length; at += COLUMNS) {
+      sum += logStrictness(this.rows[at + 6] as number, this.rows[at + 7] as number);
+    }
+    this.usual = sum / Math.max(count, 1);
   }
 
   /** Levels of the ladder that cells' levels are of. */
@@ -140,6 +152,7 @@ export class Views {
     const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), smallest), largest));
     // SSIM is known in the photos' pictures alone
     const field = sent.quality === "ssim" ? 0 : Math.log(fieldOf(viewpoint));
+    this.strictness = Math.exp(logStrictness(screen, field) - this.usual);
     const [position, direction] = PLACE_LENGTHS;
     for (let i = 0, at = 0; i < this.away.length; i++, at += COLUMNS) {
       const away = square(x, y, z, rows, at);
@@ -380,7 +393,7 @@ export class LabelModel {
     let least = -Infinity;
     return this.thresholds.map((threshold, g) => {
       least = Math.max(least, threshold + (this.slopes[g] as number) * away);
-      return Math.min(least, 1);
+      return 1 - (1 - Math.min(least, 1)) / this.views.strictness;
     });
   }
 }
