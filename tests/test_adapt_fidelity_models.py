@@ -261,6 +261,9 @@ def test_wide_lenses_and_fine_screens_ask_for_more():
     )
     asked = np.exp(0.15 * fields + 0.05 * screens - 0.2 * fields * screens)
     np.testing.assert_allclose(allowed * asked[:, None], np.repeat(allowed[:1], 3, 0) * asked[0])
+    label, model = next(iter(models.items()))
+    alone = needed({label: model}, expect({label: model}, CELLS, [camera, wide, fine], K), 0.8)
+    assert np.ptp(alone[:, 0]) == 0  # a category has no neighbours there
 
 
 def test_shares_are_those_that_were_seen():

@@ -16,16 +16,18 @@ Levels are chosen cell by cell; what is promised is the category's fidelity, ove
     needed   = 1 - (1 - threshold - slope * away) / strictness              of a target (`adapt.viewpoint`),
                at most the mean of all cells' last levels                   up to the last target
     strictness = exp(0.15 f + 0.05 s - 0.2 f s)                             logs of field and screen; over
-                                                                            that of the known views
+                                                                            that of the known views; 1 where
+                                                                            there is but one category
 
 So what is missing to the full model, over what is missing on average, is a few cosines over the levels: views
 differ by 0.35 of it, of which six leave 0.05 (docs/developers/promises.md). Numbers are whole steps of units:
 a viewer has the same ones (`viewer.promises`).
 
 A target is kept where the mean reaches what is needed. Through wide lenses and on fine screens compositions
-measure less than their means more often, and thresholds are found over all of them: hence the strictness. A
-viewpoint's support is the kernel by position, direction and screen to the nearest known view; below
-`least_support` nothing is promised.
+measure less than their means more often, and thresholds are found over all of them: hence the strictness. Not
+of a splat of one category: there it kept fewer promises (docs/developers/promises.md). A viewpoint's support
+is the kernel by position, direction and screen to the nearest known view; below `least_support` nothing is
+promised.
 """
 
 from collections.abc import Mapping, Sequence
@@ -193,7 +195,8 @@ def expect(
     for label, model in models.items():
         known = views_of(cameras, model.extent, model.focal, model.screens)
         away = 1 - matern32(known[:, :6], model.photos.T, PHOTO_LENGTHS).max(1)
-        strictness = strictness_of(known, model.views)
+        if len(models) > 1:
+            strictness = strictness_of(known, model.views)
         support[:, np.searchsorted(labels, label)] = matern32(known, model.views, model.lengths[:3]).max(1)
         near = matern32(known[:, :6], model.views[:, :6], PHOTO_LENGTHS)
         for cell, weights in zip(model.cells, model.weights, strict=True):

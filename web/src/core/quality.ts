@@ -114,14 +114,14 @@ export class Views {
   readonly alike: Float64Array; // [V] of place: 1 at the view
   readonly rows: Float64Array; // [V, COLUMNS]
   private readonly photos: Float64Array; // [P, PHOTO_COLUMNS]
-  strictness = 1; // of screen and lens: divides the loss that thresholds allow
+  strictness = 1; // of screen and lens: divides the loss that thresholds allow; 1 of one label alone
   private readonly usual: number; // log of the strictness, mean over the views
   fromPhotos = Number.NaN; // of the current viewpoint: 0 at a photo, 1 far from all; NaN: none are known
 
   constructor(
     private readonly sent: Pick<
       Promises,
-      "quality" | "views" | "photos" | "extent" | "focal" | "screens" | "levels"
+      "quality" | "views" | "photos" | "extent" | "focal" | "screens" | "levels" | "labels"
     >,
   ) {
     this.rows = byRow(sent.views);
@@ -152,7 +152,7 @@ export class Views {
     const screen = Math.log(Math.min(Math.max(screenOf(viewpoint, sent), smallest), largest));
     // SSIM is known in the photos' pictures alone
     const field = sent.quality === "ssim" ? 0 : Math.log(fieldOf(viewpoint));
-    this.strictness = Math.exp(logStrictness(screen, field) - this.usual);
+    if (sent.labels.length > 1) this.strictness = Math.exp(logStrictness(screen, field) - this.usual);
     const [position, direction] = PLACE_LENGTHS;
     for (let i = 0, at = 0; i < this.away.length; i++, at += COLUMNS) {
       const away = square(x, y, z, rows, at);
