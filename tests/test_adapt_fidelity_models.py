@@ -117,7 +117,7 @@ def test_on_the_path_and_off_it_each_keeps_its_targets():
     """Fidelity varies more where no photo is near; the models learn from few and do not know it."""
     kept, right = [], 0.5
     for seed in range(6):
-        fit, calibration, fresh = (viewpoints(n, 10 * seed + i) for i, n in enumerate((60, 160, 400)))
+        fit, calibration, fresh = (viewpoints(n, 10 * seed + i) for i, n in enumerate((60, 320, 400)))
         photos = [camera for camera in fit if camera.position[0] < -0.3]
         models = fit_fidelity(sampled(fit, seed), CELLS, fit, 2.0, 0.95, 1.0, (0.5, 2.0), photos)
         for _ in range(2):
@@ -128,7 +128,7 @@ def test_on_the_path_and_off_it_each_keeps_its_targets():
         kept.append([got[side].mean() for side in (away < 0.15, away >= 0.15)])
     near, far = np.mean(kept, 0)
     assert far > 0.93
-    assert near < 0.995  # one threshold for both keeps all of these
+    assert near < 0.99  # one threshold for both keeps all of these
 
 
 @pytest.mark.parametrize("confidence", [0.9, 0.95])

@@ -38,10 +38,9 @@ from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import cho_factor, cho_solve
 
 from sagesplat.adapt.cells import Cells, Sight, look
-from sagesplat.adapt.process import covariance, inputs_of, matern32
+from sagesplat.adapt.process import inputs_of, matern32, weights_from
 from sagesplat.adapt.viewpoint import (
     NO_CALIBRATION,
     PHOTO_LENGTHS,
@@ -104,17 +103,16 @@ class FidelityModel:
         """The levels that it predicts, ascending."""
         return tuple(range(1, len(self.cells[0].offsets) + 1))
 
-    def inputs_of(self, cell: CellModel) -> Float[np.ndarray, "n 9"]:
+    def own_inputs(self, cell: CellModel) -> Float[np.ndarray, "n 9"]:
         """The inputs of the views behind a cell's process."""
         return np.column_stack([self.views[cell.rows], cell.log_distances])
 
     @cached_property
     def weights(self) -> tuple[np.ndarray, ...]:
         """The weights of each cell's n views, from its values in them: [n, J]."""
-        factors = (cho_factor(covariance(self.inputs_of(cell), self.lengths)) for cell in self.cells)
         return tuple(
-            cho_solve(factor, VALUE_STEP * cell.values.T)
-            for factor, cell in zip(factors, self.cells, strict=True)
+            weights_from(self.own_inputs(cell), VALUE_STEP * cell.values.T, self.lengths)
+            for cell in self.cells
         )
 
     @property
@@ -240,7 +238,7 @@ def cell_means(
     if len(cell.rows):
         seen = np.isfinite(distance) & (distance > 0)
         log = np.where(seen, np.log(np.where(seen, distance, 1.0)), cell.median_log_distance)
-        terms = matern32(np.column_stack([known, log]), model.inputs_of(cell), model.lengths) @ weights
+        terms = matern32(np.column_stack([known, log]), model.own_inputs(cell), model.lengths) @ weights
         mean = mean + terms @ shapes_of(cell.offsets, cell.places)
     return monotone(mean)
 

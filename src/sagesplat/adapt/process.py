@@ -92,7 +92,7 @@ def values_at(
 ) -> Float[np.ndarray, "m K"]:
     """Values at rounded inputs, by which a process predicts in its own views what these weights do.
 
-    A reader solves `covariance(sent) weights = values`.
+    `weights_from` is how a reader gets the weights back.
     """
     if not len(own):
         return np.zeros((len(sent), weights.shape[1]))
@@ -100,6 +100,13 @@ def values_at(
     found = lstsq(matern32(own, sent, lengths), expected, cond=1e-9, lapack_driver="gelsy")
     assert found is not None  # as its stub has it
     return covariance(sent, lengths) @ found[0]
+
+
+def weights_from(
+    inputs: Float[np.ndarray, "n 9"], values: Float[np.ndarray, "n K"], lengths: Sequence[float]
+) -> Float[np.ndarray, "n K"]:
+    """The weights of views, from the values in them (`values_at`)."""
+    return cho_solve(cho_factor(covariance(inputs, lengths)), values)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import cho_factor, cho_solve
 
 from sagesplat.adapt.cell_models import FACTOR_STEP, STEP, CellModel, FidelityModel
 from sagesplat.adapt.eq3 import SsimModel
-from sagesplat.adapt.process import covariance, inputs_of, matern32
+from sagesplat.adapt.process import inputs_of, matern32, weights_from
 from sagesplat.adapt.viewpoint import Calibration, Prediction, away_from, means_at, monotone
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.quality import curve_of
@@ -174,7 +173,7 @@ def _weights(
     cell: dict[str, Any], inputs: Float[np.ndarray, "n 9"], lengths: Sequence[float]
 ) -> Float[np.ndarray, "n K"]:
     values = np.cumsum(np.cumsum(cell["values"]["steps"], 0), 1).T * cell["values"]["units"]
-    return cho_solve(cho_factor(covariance(inputs, lengths)), values)
+    return weights_from(inputs, values, lengths)
 
 
 def _lengths(entry: dict[str, Any]) -> _Lengths:
