@@ -14,13 +14,21 @@ from conftest import Call
 
 from sagesplat.adapt.plan_files import read_plans
 from sagesplat.cli.console import Console
-from sagesplat.core.config import FitConfig, PlanConfig, TrainConfig
+from sagesplat.core.config import (
+    AdoptConfig,
+    FitConfig,
+    NestConfig,
+    PlanConfig,
+    RunConfig,
+    SampleConfig,
+    TrainConfig,
+)
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped, Training, Warned
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json
 from sagesplat.run.job import Job
-from sagesplat.run.recorded import recorded_settings
+from sagesplat.run.recorded import recorded_settings, write_begun
 from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import pipeline, preflight, train
 from sagesplat.stages import plan as plan_stage
@@ -94,15 +102,56 @@ def test_a_given_target_drops_the_recorded_ones(
     assert asked(budget, "--target-fidelity", "0.8", "--budget", "2e5").budget == 2e5
 
 
+def test_recorded_dictionaries_and_flags_that_are_off_can_be_given_again(
+    run: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    seen = {}
+    monkeypatch.setattr(plan_stage, "make_plan", lambda job, config: seen.update(config=config))
+    monkeypatch.setattr(plan_stage, "show_plan", lambda job: None)
+    for stage, more in (("plan", {"weights": {"vase": 5.0}}), ("train", {"antialiased": False})):
+        record = RunDir(run, "snapshots").provenance(stage)
+        made = read_json(record)
+        made["settings"] |= more
+        record.write_text(json.dumps(made))
+    for words, weights in (((), {"vase": 5.0}), (("--weights", "tree", "3"), {"tree": 3.0})):
+        code, said = command("plan", run, *words)
+        assert code == 0, said
+        assert seen["config"].weights == weights
+    code, said = command("run", run / "nowhere", run)
+    assert "--train.no-antialiased" in said
+    code, said = command("run", run / "nowhere", run, "--train.no-antialiased")
+    assert "no option" not in said
+    assert "antialiased" not in said.partition("settings of")[2].partition("nowhere")[0]
+
+
+def test_a_run_that_did_not_end_has_its_settings(tmp_path: Path) -> None:
+    """Also those of stages that were not reached."""
+    run = RunDir(tmp_path)
+    asked = RunConfig(
+        nest=NestConfig(steps=100),
+        sample=SampleConfig(views=30),
+        plan=PlanConfig(0.8, weights={"a": 2.0}),
+        seed=3,
+    )
+    write_begun(run, asked, AdoptConfig(fit="none", cameras=tmp_path))
+    known = recorded_settings(run, of="nest")
+    assert (known["nest"], known["sample"], known["plan"], known["seed"]) == (
+        asked.nest, asked.sample, asked.plan, 3,
+    )  # fmt: skip
+    assert "adopt" not in known  # there is no splat yet
+    run.begun.write_text("{")
+    assert "nest" not in recorded_settings(run)
+
+
 def test_a_refusal_says_what_differs_and_its_cure_works(run: Path, command: Call) -> None:
     code, said = command("plan", run, "--target-ssim", "0.5")
     assert code == 2
-    assert "target_ssim (0.4 then, 0.5 now)" in said
+    assert "target-ssim (0.4 then, 0.5 now)" in said
     assert "add --force" in said
     code, said = command("plan", run, "--target-ssim", "0.5", "--force")
     assert code == 0
     assert "--force: " in said
-    assert "made with other target_ssim (0.4 then, 0.5 now)" in said
+    assert "made with other target-ssim (0.4 then, 0.5 now)" in said
     assert re.search(r"plan is redone \(it took \d+ s\)", said)  # a second on a busy machine
     assert "compose, evaluate, report" in said
     assert command("compose", run)[0] == 0  # it follows the plan without --force

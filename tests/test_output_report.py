@@ -23,7 +23,7 @@ from sagesplat.adapt.viewpoint import QualityKind
 from sagesplat.output import figures, report_figures
 from sagesplat.output.figures import Panel
 from sagesplat.output.next_steps import Commands, next_steps
-from sagesplat.output.place_figures import Place
+from sagesplat.output.place_figures import Place, viewpoint_map
 from sagesplat.output.report import write_report
 from sagesplat.output.report_data import Look, PromiseFacts, ReportData
 
@@ -280,6 +280,15 @@ def whole_page() -> ReportData:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     return write_report(tmp_path_factory.mktemp("whole"), whole_page())
+
+
+def test_a_map_of_shares_that_are_all_alike_has_the_whole_scale():
+    place = whole_page().drawn_at
+    for share in (1.0, np.nan):
+        figure = viewpoint_map(place, np.full(10, share))
+        assert {
+            dots.get_clim() for dots in figure.axes[0].collections[1:] if dots.get_array() is not None
+        } == {(0.0, 1.0)}
 
 
 def test_what_was_asked_is_pictured_with_its_bytes_and_what_it_measures(whole):

@@ -202,6 +202,8 @@ def test_bad_input_is_one_line(run: Path, tmp_path: Path, viewer: Path) -> None:
         bundle(job, out, always=["unicorn"], weights={"dragon": 2}, viewer=viewer)
     with pytest.raises(RunError, match=r"weight .* is impossible"):
         bundle(job, out, weights={job.taxonomy.name(-1): float("nan")}, viewer=viewer)
+    with pytest.raises(RunError, match=r"a\.html: a bundle is a folder; add --single-file for one page"):
+        bundle(job, tmp_path / "a.html", viewer=viewer)
     with pytest.raises(RunError, match="metres per unit are impossible"):
         bundle(job, out, meters_per_unit=0.0, viewer=viewer)
     chunk = next((run / "nested" / "increments").glob("*.sgst"))

@@ -13,6 +13,7 @@ from conftest import DemoRun, job_of, pinhole, random_gaussians, write_capture
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sagesplat import FinishedRun
 from sagesplat.adapt.coverage import PREDICTORS
 from sagesplat.adapt.evaluate import read_evaluation
 from sagesplat.adapt.ladder import PrefixLadder, read_prefixes
@@ -384,6 +385,7 @@ def test_budgets_are_kept_and_more_bytes_promise_more(finished: Path, tmp_path: 
     plan = read_budget_plan(job.run.plan)
     assert plan is not None
     assert len(read_ply(job.run.composed)) == plan.count
+    assert FinishedRun(job).plans[0].budget == plan.budget  # the main plan comes first
     nested = NestedLevels(job)
     train = job.scene.train_ids
     quality, shown = nested.qualities["ssim"].mean[train], nested.shown[train]

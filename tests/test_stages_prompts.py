@@ -147,7 +147,7 @@ def test_words_over_a_network_s_categories(
     assert job.taxonomy.names == {193: "grass-merged", 201: "stone fountain"}
     label_ids = job.masks[job.scene.views[0]]
     assert (label_ids == np.where(np.arange(64) < 32, 201, 193)).all()
-    with pytest.raises(RunError, match="over_prompts"):
+    with pytest.raises(RunError, match="over-prompts"):
         make_masks(job, MasksConfig(segmenter="hf", model="a/b", prompts="ivy"))
 
 

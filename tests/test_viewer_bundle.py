@@ -615,6 +615,12 @@ def test_another_folder_is_left_alone(tmp_path, contents, viewer) -> None:
         write_bundle(tmp_path / "file", contents, viewer)
     with pytest.raises(RunError, match="cannot be written"):
         write_bundle(tmp_path / "file" / "out", contents, viewer)
+    (out / "mine.html").write_text("x")
+    with pytest.raises(RunError, match=r"mine\.html: no part of a bundle"):
+        write_bundle(out, contents, viewer)
+    assert (out / "mine.html").exists()
+    (out / "mine.html").unlink()
+    write_bundle(out, contents, viewer)
     assert (tmp_path / "file").read_text() == "x"
     assert [p.name for p in other.iterdir()] == ["manifest.json"]
 

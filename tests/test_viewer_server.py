@@ -18,6 +18,7 @@ from benchmarks.server import make_certificate, measure
 from sagesplat.core.errors import RunError
 from sagesplat.stages.view import show
 from sagesplat.viewer import server
+from sagesplat.viewer.server import connection_hint
 
 pytest.importorskip("starlette", reason="needs the extra `view`")
 pytest.importorskip("uvicorn", reason="needs the extra `view`")
@@ -83,6 +84,11 @@ def test_without_a_host_only_this_machine_gets_in(bundle: Path):
     with show(bundle, print, port=0, host="0.0.0.0") as view:
         assert view.urls[0].startswith("http://localhost:")
         assert "--ssl-certfile" in view.hint
+
+
+def test_a_headset_is_told_the_port_alone():
+    said = connection_hint(("http://localhost:8000/#edit=pKih",), secure=False, host=None)
+    assert "`adb reverse tcp:8000 tcp:8000`, then open http://localhost:8000/ there" in said
 
 
 def test_rubbish_is_refused_and_the_server_goes_on(bundle: Path):

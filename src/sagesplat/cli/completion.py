@@ -19,7 +19,7 @@ def script(shell: str) -> str:
 
 def _typed(flag: Flag) -> str:
     """A flag as one types it: what is on already can only be turned off."""
-    return flag.name.replace("--", "--no-", 1) if flag.default is True else flag.name
+    return flag.off if flag.default is True else flag.name
 
 
 def _choices(flag: Flag) -> list[str]:

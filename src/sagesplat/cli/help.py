@@ -38,6 +38,17 @@ class Flag:
     setting: tuple[str, ...]  # the parameter of the command, and the field of its dataclass
     kind: Any  # its annotation, with limits
 
+    @property
+    def off(self) -> str:
+        """How one that is on or off is turned off: --no-fuse, --train.no-antialiased."""
+        first, dot, last = self.name.rpartition(".")
+        return f"{first}.no-{last}" if dot else self.name.replace("--", "--no-", 1)
+
+
+def flag_of(word: str) -> str:
+    """The name of the flag that a word names, also one that turns it off."""
+    return re.sub(r"(^--|\.)no-", r"\1", word.partition("=")[0].replace("_", "-"), count=1)
+
 
 def flags_of(function: Callable[..., None]) -> Iterator[Flag]:
     """The arguments of a command, in the order of its parameters and of their dataclasses' fields."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import tyro
 
-from sagesplat.cli.help import Flag, flags_of
+from sagesplat.cli.help import Flag, flag_of, flags_of
 from sagesplat.cli.say import say
 from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import SageError
@@ -37,7 +37,8 @@ def arguments(name: str, function: Callable[..., None], words: Sequence[str]) ->
     words = _joined(words)
     values = _parse(name, function, words)
     known = _recorded(name, function, values, words)
-    values = _parse(name, _with_defaults(function, known), words) if known else values
+    if known:
+        values = _with_dicts(_parse(name, _with_defaults(function, known), words), known)
     for flag in flags_of(function):
         value = values[flag.setting[0]]
         value = getattr(value, flag.setting[1]) if len(flag.setting) == 2 else value
@@ -80,9 +81,9 @@ def _parse(name: str, function: Callable[..., None], words: Sequence[str]) -> di
             print(printed.getvalue(), end="")
             raise
         # an unknown option can make tyro complain of the positional argument beside it
-        known = {flag.name.replace("--no-", "--", 1) for flag in flags_of(function)}
+        known = {flag_of(flag.name) for flag in flags_of(function)}
         flags = [word.partition("=")[0] for word in words if word.startswith("--")]
-        strange = [flag for flag in flags if flag.replace("_", "-").replace("--no-", "--", 1) not in known]
+        strange = [flag for flag in flags if flag_of(flag) not in known]
         reason = _unknown(function, strange) if strange else _flat(printed.getvalue())
         raise UsageError(f"{reason}; see `{prog} --help`") from None
     if unknown:
@@ -124,9 +125,30 @@ def _with_defaults(function: Callable[..., None], values: Mapping[str, Any]) -> 
         function(*args, **options)
 
     signature = inspect.signature(function)
+    values = {name: _without_dicts(value) for name, value in values.items()}
     changed = [p.replace(default=values.get(p.name, p.default)) for p in signature.parameters.values()]
     command.__signature__ = signature.replace(parameters=changed)  # type: ignore
     return command
+
+
+def _without_dicts(value: Any) -> Any:
+    """Settings without the entries of dictionaries: tyro takes a default's keys for the only ones."""
+    return replace(value, **{name: {} for name in _dicts(value)}) if is_dataclass(value) else value
+
+
+def _with_dicts(values: dict[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Parsed values with the recorded dictionaries where none were given."""
+    found = dict(values)
+    for name, value in known.items():
+        kept = {key: entries for key, entries in _dicts(value).items() if not getattr(found[name], key)}
+        found[name] = replace(found[name], **kept) if kept else found[name]
+    return found
+
+
+def _dicts(value: Any) -> dict[str, dict]:
+    """The dictionaries of settings, by the name of their field."""
+    own = {field.name: getattr(value, field.name) for field in fields(value)} if is_dataclass(value) else {}
+    return {name: entries for name, entries in own.items() if isinstance(entries, dict)}
 
 
 def _recorded(
@@ -141,7 +163,7 @@ def _recorded(
 
     check_links(path)
 
-    given = {word.partition("=")[0].replace("_", "-").replace("--no-", "--") for word in words}
+    given = {flag_of(word) for word in words}
     ladder = values.get("ladder") if "--ladder" in given else recorded_ladder(path)
     known = recorded_settings(RunDir(path, ladder or "nested"), of=name) | {"ladder": ladder}
     if given & _SOURCES:
@@ -182,7 +204,7 @@ def _now(flag: Flag, known: Mapping[str, Any], default: Any) -> Any:
 def _typed(flag: Flag, value: Any) -> str:
     """A flag with its value, as one types them."""
     if isinstance(value, bool):
-        return flag.name if value else flag.name.replace("--", "--no-", 1)
+        return flag.name if value else flag.off
     parts = [x for pair in value.items() for x in pair] if isinstance(value, dict) else value
     text = " ".join(map(str, parts)) if isinstance(parts, tuple | list) else str(parts)
     return f"{flag.name} {text}"

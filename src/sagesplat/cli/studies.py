@@ -52,11 +52,14 @@ def transfer(
         targets: SSIM targets (default: those that B was planned for)
         lpips: folder with the LPIPS weights (default: where `sagesplat download lpips` puts them)
     """
+    from sagesplat.stages.scene import check_not_adopted
     from sagesplat.studies.paper.snapshots import adapt_snapshots
     from sagesplat.studies.transfer.run import transfer as evaluate_transfer
 
     out = out or run_b / "transfer"
     with open_job(run_a, machine, "snapshots") as job_a, open_job(run_b, machine, "snapshots") as job_b:
+        for job in (job_a, job_b):  # before the work
+            check_not_adopted(job.run)
         adapt_snapshots(job_a)
         adapt_snapshots(job_b)
         table, line = evaluate_transfer(job_a, job_b, out, targets, lpips)
@@ -81,7 +84,7 @@ def early_stopping(
         out: folder for the tables (default: RUN_STOPPED/early_stopping)
     """
     from sagesplat.stages.scene import check_not_adopted
-    from sagesplat.studies.early_stopping import compare_early_stopping
+    from sagesplat.studies.early_stopping import check_runs, compare_early_stopping
     from sagesplat.studies.paper.snapshots import observe_snapshots
 
     out = out or stopped / "early_stopping"
@@ -90,6 +93,7 @@ def early_stopping(
         open_job(full, machine, "snapshots") as job_full,
     ):
         check_not_adopted(job_stopped.run)
+        check_runs(job_stopped, job_full)  # before the work
         observe_snapshots(job_full)
         table, _ = compare_early_stopping(job_stopped, job_full, out)
         job_stopped.emit(table.event)

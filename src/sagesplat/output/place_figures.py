@@ -76,7 +76,9 @@ def _from_above(
     ends = place.at + _ARROW * size[0] * place.towards
     axes.plot(*np.stack([place.at, ends], axis=1).transpose(2, 1, 0), color=INK, lw=0.8, zorder=3)
     known = np.isfinite(values)
-    limits = np.quantile(values[known], [0.0, 1.0]) if known.any() else np.array([0.0, 1.0])
+    limits = values[known].min(initial=1.0), values[known].max(initial=0.0)
+    if limits[0] >= limits[1]:  # none, or all alike: the whole scale
+        limits = 0.0, 1.0
     for rows, ring, dot in ((~ringed, "white", 42), (ringed, INK, 90)):
         dots = axes.scatter(
             *place.at[rows].T, s=dot, c=values[rows], cmap="RdYlBu", vmin=limits[0], vmax=limits[1],

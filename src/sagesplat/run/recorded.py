@@ -1,11 +1,14 @@
 """The settings that a run folder knows: defaults of the next command on it."""
 
-from dataclasses import dataclass, fields
+import json
+from collections import ChainMap
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 from sagesplat.core import config
 from sagesplat.core.limits import NotNegative, Seed
+from sagesplat.io.files import write_json
 from sagesplat.io.typed import convert_as, known_json
 from sagesplat.run.records import FORMAT
 from sagesplat.run.run_dir import RunDir
@@ -23,35 +26,48 @@ def recorded_ladder(path: Path) -> config.LadderKind:
 def recorded_settings(run: RunDir, of: str = "run") -> dict[str, Any]:
     """What a run's records hold, by the name of the setting in `RunConfig` (with `scene_config` for `scene`).
 
-    A stage that was never done is left out, and so is what cannot be read: the stage itself says what is
-    wrong with it. A training that was begun and killed counts. `of`: the command that asks; the seed is that
-    of its stage.
+    A stage that was never done has what a run that did not end was given for it, or is left out; and so is
+    what cannot be read: the stage itself says what is wrong with it. `of`: the command that asks; the seed is
+    that of its stage.
     """
-    train = _made(run, "train") or _begun(run)
-    nest = _made(run, "nest")
-    observed = {**_made(run, "observe"), **_made(run, "fit")}
-    adopted = _made(run, "adopt")
+    begun = known_json(run.begun, dict[str, dict[str, Any]]) or {}
+
+    def given(name: str, *stages: str) -> dict[str, Any]:
+        made = [_made(run, stage) for stage in stages or (name,)]
+        return dict(ChainMap(*reversed(made), begun.get(name, {})))
+
+    train = _made(run, "train") or _begun(run) or begun.get("train", {})
+    nest, adopted = given("nest"), _made(run, "adopt")
+    levels = _levels_of_adopted(_made(run, "nest") or begun.get("adopt", {}))
     scene, label_images = known_json(run.scene, _Made), known_json(run.segmentation, dict) or {}
-    if adopted.get("labelled"):
+    if adopted.get("labels_of_file"):
         label_images = {}  # made by adopt
     seeded = _config(_Seeded, nest if of == "nest" and nest else train)
     known: dict[str, Any] = {
-        "adopt": _config(config.AdoptConfig, {**adopted, **_levels_of_adopted(nest)}) if adopted else None,
+        "adopt": _config(config.AdoptConfig, {**adopted, **levels}) if adopted else None,
         "scene_config": _config(config.SceneConfig, scene.settings) if scene else None,
         "poses": _config(config.PosesConfig, _made(run, "poses")),
         "masks": _config(config.MasksConfig, label_images),
         "labels": _config(config.LabelsConfig, _labels(run)),
         "train": _config(config.TrainConfig, train),
-        "clean": _config(config.CleanConfig, _made(run, "clean")),
+        "clean": _config(config.CleanConfig, given("clean")),
         "blocks": _config(config.BlocksConfig, _made(run, "blocks")),
         "nest": _config(config.NestConfig, nest),
-        "sample": _config(config.SampleConfig, _made(run, "sample")),
-        "fit": _config(config.FitConfig, observed),
-        "plan": _config(config.PlanConfig, _made(run, "plan")),
+        "sample": _config(config.SampleConfig, given("sample")),
+        "fit": _config(config.FitConfig, given("fit", "observe", "fit")),
+        "plan": _config(config.PlanConfig, given("plan")),
         "seed": seeded.seed if seeded else None,
         "fuse": True if run.provenance("fuse").exists() else None,
     }
     return {name: value for name, value in known.items() if value is not None}
+
+
+def write_begun(run: RunDir, asked: config.RunConfig, adopt: config.AdoptConfig | None = None) -> None:
+    """Write down the settings of a run that begins, for the stages that it may not reach."""
+    names = ("train", "clean", "nest", "sample", "fit", "plan")
+    settings = {name: asdict(getattr(asked, name)) | {"seed": asked.seed} for name in names}
+    settings |= {"adopt": asdict(adopt)} if adopt else {}
+    write_json(run.begun, json.loads(json.dumps(settings, default=str)))
 
 
 def _labels(run: RunDir) -> dict[str, Any]:

@@ -169,11 +169,17 @@ def _record_of(run: RunDir, stage: str) -> dict[str, Any]:
     return read_record(run.provenance(stage))
 
 
+def _typed(settings: Mapping[str, Any], name: str) -> str:
+    """A setting as one would type it."""
+    value = settings.get(name, "not set")
+    return {True: "on", False: "off"}[value] if isinstance(value, bool) else short(value)
+
+
 def _differences(made: Mapping[str, Any], settings: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
     """A few words on what changed since a result was made; empty = nothing."""
     old, new = made["settings"], settings
     changed = [
-        f"{short(k)} ({short(old.get(k, 'not set'))} then, {short(new.get(k, 'not set'))} now)"
+        f"{short(k).replace('_', '-')} ({_typed(old, k)} then, {_typed(new, k)} now)"
         for k in [*new, *(k for k in old if k not in new)]
         if k not in old or k not in new or old[k] != new[k]
     ]

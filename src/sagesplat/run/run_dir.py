@@ -51,6 +51,7 @@ class RunDir:
     scene = _In("scene.json")  # where the capture is and how it is read
     photo_hashes = _In("photos.json")  # sizes, times and hashes of the photos, when last looked at
     source_hashes = _In("source.json")  # the same of the photos, or the video, that poses were estimated from
+    begun = _In("begun.json")  # settings of a run that did not end
     geometry = _In("geometry.npz")  # cameras and points: results can be shown without the capture
     capture = _In("capture")  # the folder of the capture that was made of photos without poses
     adopted = _In("adopted.npz")  # the Gaussians of a splat that somebody else trained, as they were read

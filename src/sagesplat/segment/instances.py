@@ -102,7 +102,7 @@ def wanted_ids(names: dict[int, str], wanted: Sequence[str]) -> list[int]:
     unknown = [name for name in wanted if name not in (*names.values(), EVERY, THINGS)]
     if unknown:
         raise LabelError(
-            f"instances: no category {unknown[0]!r}; there are {', '.join(sorted(names.values()))}"
+            f"--labels.instances: no category {unknown[0]!r}; there are {', '.join(sorted(names.values()))}"
         )
     return [
         label_id

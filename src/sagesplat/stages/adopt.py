@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -116,7 +117,8 @@ def _make_capture(
     given = [] if config.cameras is None else read_camera_file(config.cameras, scene.images)
     photos = bool(given) and all(one.photo is not None for one in given)
     names = ("cameras", "views", "kind", "up", "fov", "size", "lod", "spz_axes", "seed")
-    settings = {name: getattr(config, name) for name in names} | {"labelled": labelled, "photos": photos}
+    settings: dict[str, Any] = {"labels_of_file": labelled, "photos": photos}
+    settings |= {name: getattr(config, name) for name in names}
     settings |= {name: reading(scene)[name] for name in ("downscale", "images", "fisheye")}
     settings["cameras"] = config.cameras and str(config.cameras.resolve())
     settings |= {"source": str(source.resolve()), "content": _content(source)}

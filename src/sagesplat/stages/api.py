@@ -31,7 +31,7 @@ from sagesplat.stages.given import write_given_cameras, write_given_splat
 from sagesplat.stages.method import Method
 from sagesplat.stages.methods import NestedLevels, method_of
 from sagesplat.stages.plan import check_targets
-from sagesplat.stages.results import plans_of
+from sagesplat.stages.results import budget_plan_of, plans_of
 from sagesplat.viewer.notebook import NotebookViewer
 
 
@@ -278,8 +278,13 @@ class FinishedRun:
 
     @cached_property
     def plans(self) -> tuple[Plan, ...]:
-        """The scene's plans, those of the quality that leads first. RunError before `sagesplat plan`."""
-        return tuple(replace(plan, titles=self.titles) for plan in plans_of(self.job))
+        """The scene's plans: the one for a budget first, then those of the quality that leads.
+
+        RunError before `sagesplat plan`.
+        """
+        within = budget_plan_of(self.job)
+        plans = [*([within] if within else []), *plans_of(self.job)]
+        return tuple(replace(plan, titles=self.titles) for plan in plans)
 
     @cached_property
     def _method(self) -> Method:

@@ -96,6 +96,8 @@ def bundle(
     weights = edited.weights | given
     _check_asked(job, meters_per_unit, always, weights)
     viewer = viewer or package_viewer()
+    if not single_file and out.suffix.lower() in (".html", ".htm"):
+        raise RunError(f"{out}: a bundle is a folder; add --single-file for one page")
     (check_page if single_file else check_target)(out)
     check_viewer(viewer)
     listed = increments_of(job)

@@ -21,6 +21,7 @@ from sagesplat.demo.capture import cached_capture
 from sagesplat.demo.wild import EVERYTHING, NOTHING, Wild
 from sagesplat.io.typed import check_limits
 from sagesplat.run.job import Job
+from sagesplat.run.recorded import write_begun
 from sagesplat.stages import blocks
 from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
@@ -62,6 +63,8 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     Results for the paper's levels or for the nested ladder go to folders of their own: `job.run.ladder`.
     """
     check_not_adopted(job.run)
+    if job.run.path.exists() and not job.run.path.is_dir():
+        raise RunError(f"{job.run.path}: not a folder; name another run folder")
     _check_limits(config)  # before hours of training
     check_targets(config.plan, config.ladder)
     if config.labels.instances and not method_of(job).has_instances:
@@ -69,6 +72,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
     open_scene(job, scene, config.scene, config.poses, config.masks, config.labels)
+    write_begun(job.run, config)
     if config.blocks.count == 1:
         check_training(job, config.train)
     make_masks(job, config.masks, config.labels)
@@ -87,6 +91,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
             clean_levels(job, config.clean)
         nest_scene(job, config.nest, config.seed)
     measure_and_plan(job, config)
+    job.run.begun.unlink(missing_ok=True)
 
 
 def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> None:
@@ -97,9 +102,11 @@ def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> No
     _check_limits(config)
     check_targets(config.plan, "nested")
     open_splat(job, source, adopted, config.scene, config.masks, config.labels)
+    write_begun(job.run, config, adopted)
     method_of(job).check(config.plan)
     make_levels(job, adopted)
     measure_and_plan(job, config)
+    job.run.begun.unlink(missing_ok=True)
 
 
 def _check_limits(config: RunConfig) -> None:

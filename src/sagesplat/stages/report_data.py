@@ -133,7 +133,7 @@ def _adopted(job: Job, ladder: NestedLadder) -> list[tuple[str, str]]:
         ("file", Path(made["source"]).name),
         ("viewpoints", f"those of {Path(made['cameras']).name}" if made["cameras"] else drawn),
         ("compared with", "photos" if made["photos"] else "renders of the splat as it came in"),
-        ("labels", "those of the file, if it has any" if made["labelled"] else "votes of label images"),
+        ("labels", "those of the file, if it has any" if made["labels_of_file"] else "votes of label images"),
         ("lower levels", trained if nest["fit"] == "renders" else "merged Gaussians, not trained"),
         ("originals from level", originals or "1"),
         ("last level", "identical to the file" if nest["lossless"] else "the file, rounded"),

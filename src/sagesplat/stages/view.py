@@ -119,7 +119,7 @@ def _fill(site: "Site", path: Path, emit: Emit, follow: bool) -> Callable[[threa
 def is_bundle(path: Path) -> bool:
     """Whether a folder is a bundle that can be shown; RunError for one that cannot, or for no folder."""
     if not path.is_dir():
-        raise RunError(f"{path}: no such folder")
+        raise RunError(f"{path}: no such folder; name a run folder or a bundle")
     if not (path / MANIFEST).exists():
         return False
     manifest = read_json(path / MANIFEST)

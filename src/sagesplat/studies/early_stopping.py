@@ -32,7 +32,9 @@ def compare_early_stopping(stopped: Job, full: Job, out: Path) -> tuple[Table, T
     that stops it during training. Both, and the full run, are measured on the test views. Writes
     `out`/early_stopping.* and early_stopping_categories.*; RunError where the runs differ in more than that.
     """
-    target = _check(stopped, full)
+    target = check_runs(stopped, full)
+    if not full.run.observations.exists():
+        raise RunError(f"{full.run.observations}: missing; run `sagesplat observe {full.run.path}`")
     stops = read_frozen(stopped.run.frozen)
     ladder = full.ladder
     views = measured_views(full.scene, full.masks)
@@ -93,7 +95,7 @@ def first_levels(
     return chosen
 
 
-def _check(stopped: Job, full: Job) -> float:
+def check_runs(stopped: Job, full: Job) -> float:
     """The target of the stopped run; RunError where the two runs cannot be compared."""
     made, other = (settings_of(job.run, "train") for job in (stopped, full))
     target = made.get("freeze_at")
@@ -109,8 +111,6 @@ def _check(stopped: Job, full: Job) -> float:
         raise RunError(
             f"{full.run.path}: other {what} than {stopped.run.path}; train one of them like the other"
         )
-    if not full.run.observations.exists():
-        raise RunError(f"{full.run.observations}: missing; run `sagesplat observe {full.run.path}`")
     return float(target)
 
 

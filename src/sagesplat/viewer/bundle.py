@@ -5,6 +5,7 @@ describe them (`viewer.manifest`). The same contents give the same bytes.
 """
 
 import hashlib
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,6 +25,11 @@ from sagesplat.viewer.quality import dumped
 
 _CURE = "delete that folder and run `sagesplat nest` again"
 MANIFEST, SCHEMA = "manifest.json", "manifest.schema.json"
+# what is in a bundle's folder, of any version of the viewer; and what systems put into every folder
+_OWN = re.compile(
+    r"(LICENSES|THIRD_PARTY_LICENSES)\.txt|assets|chunks|index\.html|(looks|poster)\.jpg|"
+    r"manifest(\.schema)?\.json|promises-.*\.json|scene-.*\.pack|\.lock|\.DS_Store|Thumbs\.db|desktop\.ini"
+)
 LICENSES = """\
 The viewer in this folder is part of sagesplat, licensed under the Apache License, Version 2.0
 (SPDX: Apache-2.0). It contains other people's software: see THIRD_PARTY_LICENSES.txt.
@@ -107,6 +113,8 @@ def check_target(out: Path) -> None:
         return
     if out.exists() and not is_bundle(out):
         raise RunError(f"{out}: neither empty nor a bundle of sagesplat; name a new folder")
+    if strange := sorted(path.name for path in out.glob("*") if not _OWN.fullmatch(path.name)):
+        raise RunError(f"{out / strange[0]}: no part of a bundle, which is replaced as a whole; move it away")
 
 
 def is_bundle(folder: Path) -> bool:

@@ -7,6 +7,7 @@ without being asked for leave, and none is given.
 
 import hmac
 import secrets
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,5 +76,5 @@ class EditEndpoint:
             return PlainTextResponse(f"nothing was saved: {error}", 422)
         except OSError as error:
             return PlainTextResponse(f"{self._path.name} cannot be written: {error.strerror}", 500)
-        run = self._path.parent.name
+        run = shlex.quote(str(self._path.parent))
         return PlainTextResponse(f"Saved; `sagesplat labels apply {run}` makes it so")

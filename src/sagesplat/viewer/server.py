@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from sagesplat.core.errors import RunError
 
@@ -146,7 +147,7 @@ def connection_hint(urls: tuple[str, ...], secure: bool, host: str | None) -> st
     """One line: how a headset connects. Browsers offer WebXR on localhost and https only."""
     if secure and host is not None:
         return f"headset: open {urls[-1]} there and accept the certificate"
-    port = urls[0].rstrip("/").rpartition(":")[2]
+    port = urlsplit(urls[0]).port
     local = f"http{'s' * secure}://localhost:{port}/"
     cable = f"by cable `adb reverse tcp:{port} tcp:{port}`, then open {local} there"
     return f"headset: {cable}; by network --host 0.0.0.0 with --ssl-certfile and --ssl-keyfile"
