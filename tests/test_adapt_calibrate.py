@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from sagesplat.adapt.calibrate import (
     OTHERS,
     conformal_quantile,
+    critical_asks,
     critical_margins,
-    critical_nominals,
     fewest_views,
 )
 
@@ -75,11 +75,11 @@ def test_critical_margins_by_trying_all(seed, levels):
                 assert misses
 
 
-def test_critical_nominals_between_compositions():
+def test_critical_asks_between_compositions():
     nominal, bound = np.array([0.4, 0.6, 0.8, 0.95]), np.array([[0.5, 0.62, 0.8, 1.0]])
 
     def critical(measured, steps=(4, 4, 4), target=0.6):
-        return critical_nominals(nominal, bound, np.array([steps]), np.array([measured]), target)[0]
+        return critical_asks(nominal[None], bound, np.array([steps]), np.array([measured]), target)[0]
 
     assert critical([0.5, 0.7, 0.8, 1.0]) == pytest.approx(0.56)  # two of the four steps miss
     assert critical([0.5, 0.7, 0.8, 1.0], (1, 4, 4)) == pytest.approx(0.5)  # the next one keeps

@@ -38,18 +38,19 @@ def fewest_views(confidence: float) -> int:
 
 
 def conformal_quantile(
-    values: Float[np.ndarray, " n"], confidence: float, others: Float[np.ndarray, " m"] = NO_OTHERS
-) -> float:
+    values: Float[np.ndarray, "*s n"], confidence: float, others: Float[np.ndarray, "*s m"] = NO_OTHERS
+) -> Float[np.ndarray, "*s"]:
     """The value that a new one does not exceed at a confidence; inf from too few values.
 
     `others`: of other categories, which together count as at most `OTHERS` values.
     """
-    weight = np.ones(len(values) + len(others))
-    weight[len(values) :] = min(OTHERS / max(len(others), 1), 1)
-    ordered = np.concatenate([values, others])
-    order = np.argsort(ordered)
-    enough = np.cumsum(weight[order]) >= (weight.sum() + 1) * confidence - 1e-9
-    return float(ordered[order][enough.argmax()]) if enough.any() else math.inf
+    n, m = values.shape[-1], others.shape[-1]
+    weight = np.concatenate([np.ones(n), np.full(m, min(OTHERS / max(m, 1), 1)), [1.0]])
+    every = np.concatenate([values, others, np.full((*values.shape[:-1], 1), np.inf)], -1)  # a new one: any
+    order = np.argsort(every, -1)
+    enough = np.cumsum(weight[order], -1) >= weight.sum() * confidence - 1e-9
+    rows = np.take_along_axis(order, enough.argmax(-1)[..., None], -1)
+    return np.take_along_axis(every, rows, -1)[..., 0]
 
 
 def critical_margins(
@@ -67,26 +68,25 @@ def critical_margins(
     return np.where(missed, (mean - target) / scale[:, None], -np.inf).max(1)
 
 
-def critical_nominals(
-    nominal: Float[np.ndarray, " J"],
-    bound: Float[np.ndarray, "n J"],
+def critical_asks(
+    asked: Float[np.ndarray, "n J"],
+    reached: Float[np.ndarray, "n J"],
     steps: Int[np.ndarray, "n J-1"],
     measured: Float[np.ndarray, "n J"],
     target: float,
 ) -> Float[np.ndarray, " n"]:
-    """In each view, the largest nominal target for which a composition is taken that misses the target.
+    """In each view, the most that can be asked for and a composition is taken that misses the target.
 
     Args:
-        nominal: [J], ascending: the targets that compositions were planned for.
-        bound: [n, J], what is promised of each: a composition is taken for all nominal targets up to that.
+        asked: [n, J], ascending: nominal targets that compositions were planned for, or their thresholds.
+        reached: [n, J], in the same unit what each has: a composition is taken for all that is up to that.
         steps: [n, J - 1], compositions from each one to the next, that one included: levels between them.
         measured: [n, J], quality in the composition.
         target: That is to be kept.
 
     Returns:
-        [n]. What compositions between two measure, and what is promised of them, is interpolated. The first
-        nominal target where none misses; 1 where the last one does: nothing but the full model is known to
-        keep the target.
+        [n]. What compositions between two measure and have is interpolated. The first that was asked for
+        where none misses; 1 where the last one does: nothing but the full model is known to keep the target.
     """
     n, J = measured.shape
     missed = measured < target
@@ -96,7 +96,7 @@ def critical_nominals(
     part = np.clip((target - low) / np.maximum(high - low, 1e-12), 0, 1)
     between = np.column_stack([steps, np.zeros(n, int)])[rows, last]
     taken = np.minimum(np.floor(part * between), between - 1) / np.maximum(between, 1)
-    found = bound[rows, last] + taken * (bound[rows, after] - bound[rows, last])
+    found = reached[rows, last] + taken * (reached[rows, after] - reached[rows, last])
     # the same levels in both: their neighbours' levels made the difference
-    found = np.maximum(np.where(between > 0, found, nominal[after]), nominal[last])
-    return np.where(missed.any(1), np.where(last == J - 1, 1.0, found), nominal[0])
+    found = np.maximum(np.where(between > 0, found, asked[rows, after]), asked[rows, last])
+    return np.where(missed.any(1), np.where(last == J - 1, 1.0, found), asked[:, 0])

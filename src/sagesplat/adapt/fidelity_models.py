@@ -14,8 +14,9 @@ Three sets of drawn viewpoints are used, each for one thing:
    done twice.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -23,8 +24,8 @@ from jaxtyping import Bool, Float, Float32, Int
 from sagesplat.adapt.calibrate import (
     AT_A_PHOTO,
     conformal_quantile,
+    critical_asks,
     critical_margins,
-    critical_nominals,
     fewest_views,
 )
 from sagesplat.adapt.cell_models import (
@@ -77,6 +78,7 @@ _NEAR = 0.15  # `Expected.away` of viewpoints that count as on the capture's pat
 # do than of all viewpoints, and each kind is to keep its share (docs/developers/promises.md).
 _OF_MISSES = 0.8
 _FEW = 10  # viewpoints on it, and off it, from which on both are looked at
+_STEEPEST, _HALVINGS = 2.0, 20  # of thresholds over `Expected.away`
 
 
 def fit_fidelity(
@@ -191,7 +193,7 @@ def _fit(
         *_MARGINS,
     )
     # that of an adopted splat is compared with what came in; of too few views the worst
-    last = max(-conformal_quantile(-category[:, -1], confidence), float(category[:, -1].min()))
+    last = max(-float(conformal_quantile(-category[:, -1], confidence)), float(category[:, -1].min()))
     return FidelityModel(
         label_id=label,
         extent=extent,
@@ -282,11 +284,18 @@ def trial_of(
     fidelity: Float32[np.ndarray, "V J L"],
 ) -> "Trial":
     """What compositions of `plan_nominal` measured, beside what is promised of them."""
-    composed = [expected.of_composition(planned[:, j]) for j in range(len(NOMINAL))]
-    bound = np.stack([promised(models, expected, mean) for mean in composed], 1)
+    mean = np.stack([expected.of_composition(planned[:, j]) for j in range(len(NOMINAL))], 1)
+    bound = np.stack([promised(models, expected, mean[:, j]) for j in range(len(NOMINAL))], 1)
+    threshold = np.full(mean.shape, np.nan)
+    for column, label in enumerate(expected.labels.tolist()):
+        if label in models:
+            asked = np.repeat(NOMINAL[:, None], len(expected.away), 1)
+            threshold[..., column] = models[label].calibration.needed(asked, expected.away).T
     steps = np.diff(planned, axis=1) @ expected.member
-    steps = np.maximum(steps, 0)
-    return Trial(expected.labels.tolist(), shown, expected.support, expected.away, bound, steps, fidelity)
+    return Trial(
+        expected.labels.tolist(), shown, expected.support, expected.away, bound, np.minimum(threshold, 1),
+        1 - (1 - mean) * expected.strictness[:, None, None], np.maximum(steps, 0), fidelity,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,6 +303,7 @@ class Decisions:
     """What the viewpoints that show a category say of it."""
 
     critical: Float[np.ndarray, "G n"]  # for each of TARGETS the critical nominal target
+    needs: Float[np.ndarray, "G n"]  # the critical threshold of each
     away: Float[np.ndarray, " n"]
 
     @property
@@ -306,9 +316,23 @@ class Decisions:
         near = int(self.near.sum())
         return (True, False) if min(near, len(self.away) - near) >= fewest else (None,)
 
-    def at(self, kind: bool | None) -> Float[np.ndarray, "G m"]:
-        """`critical` of the viewpoints on the path (True), off it (False), or of all (None)."""
-        return self.critical if kind is None else self.critical[:, self.near == kind]
+    def of(self, kind: bool | None) -> "Decisions":
+        """Of the viewpoints on the path (True), off it (False), or of all (None)."""
+        if kind is None:
+            return self
+        rows = self.near == kind
+        return Decisions(self.critical[:, rows], self.needs[:, rows], self.away[rows])
+
+    def for_model(self, model: FidelityModel) -> "Decisions":
+        """The thresholds of the model at which its bound is `critical`."""
+        needs = np.minimum(model.calibration.needed(self.critical, self.away), 1)
+        return replace(self, needs=needs)
+
+    def joined(self, others: Sequence["Decisions"]) -> "Decisions":
+        """With those of others after them."""
+        parts = [self, *others]
+        critical, needs = (np.hstack([getattr(one, name) for one in parts]) for name in ("critical", "needs"))
+        return Decisions(critical, needs, np.concatenate([one.away for one in parts]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,6 +344,8 @@ class Trial:
     support: Float[np.ndarray, "V L"]  # of the viewpoints; NaN without a model
     away: Float[np.ndarray, " V"]  # 0 at a photo, 1 far from all
     bound: Float[np.ndarray, "V J L"]  # what is promised of the compositions; NaN: nothing
+    threshold: Float[np.ndarray, "V J L"]  # that they were planned for, and what they are expected to have;
+    mean: Float[np.ndarray, "V J L"]  # both where the allowed loss is not divided by a strictness
     steps: Int[np.ndarray, "V J-1 L"]  # by how many levels of its cells each composition is above the last
     fidelity: Float32[np.ndarray, "V J L"]  # what they measure
 
@@ -327,16 +353,20 @@ class Trial:
         """Rows of the viewpoints that show a category."""
         return np.flatnonzero(self.shown[:, list(self.labels).index(label)])
 
-    def critical(self, label: int) -> Float[np.ndarray, "G n"]:
-        """For each of TARGETS the critical nominal target in the viewpoints that show the category."""
-        column, rows = list(self.labels).index(label), self.views(label)
-        got, bound = self.fidelity[rows, :, column], np.nan_to_num(self.bound[rows, :, column], nan=1.0)
-        steps = self.steps[rows, :, column]
-        return np.stack([critical_nominals(NOMINAL, bound, steps, got, target) for target in TARGETS])
-
     def decisions(self, label: int) -> Decisions:
         """What the viewpoints say of a category."""
-        return Decisions(self.critical(label), self.away[self.views(label)])
+        column, rows = list(self.labels).index(label), self.views(label)
+        bound, threshold, mean, steps, got = (
+            of[rows, :, column] for of in (self.bound, self.threshold, self.mean, self.steps, self.fidelity)
+        )
+        nominal = np.repeat(NOMINAL[None], len(rows), 0)
+        critical, needs = (
+            np.stack(
+                [critical_asks(asked, np.nan_to_num(has, nan=1.0), steps, got, target) for target in TARGETS]
+            )
+            for asked, has in ((nominal, bound), (threshold, mean))
+        )
+        return Decisions(critical, needs, self.away[rows])
 
     def missed(self, label: int) -> Int[np.ndarray, " J"]:
         """In how many of these viewpoints each of NOMINAL was missed."""
@@ -362,26 +392,35 @@ def remove_composition_bias(
     for label, model in models.items():
         if len(trial.views(label)):
             decisions = trial.decisions(label)
-            asked = [_empirical(decisions.at(kind), confidence) for kind in decisions.kinds(_FEW)]
-            found[label] = _by_place(model, decisions, asked)
+            of_kinds = [decisions.of(kind) for kind in decisions.kinds(_FEW)]
+            found[label] = _by_place(
+                model, [(some, partial(_empirical, confidence=confidence)) for some in of_kinds]
+            )
     return found
 
 
 def _by_place(
-    model: FidelityModel, decisions: Decisions, asked: Sequence[Float[np.ndarray, " G"]]
+    model: FidelityModel, of_kinds: Sequence[tuple[Decisions, Callable[[np.ndarray], np.ndarray]]]
 ) -> FidelityModel:
-    """The model with thresholds that go linearly from what viewpoints on the path need to what others do.
+    """The model with thresholds that rise linearly away from the photos by as much as viewpoints need.
 
-    `asked`: what to ask for TARGETS: of all viewpoints, or of those on the path and of those off it.
+    `of_kinds`: decisions in all viewpoints, or in those on the path and in those off it, and which quantile
+    of what they need [G, n] is kept. With both kinds the slope is the one at which they need the same
+    threshold at a photo, 0 where less is needed off the path; with one it stays unless it falls.
     """
-    if len(asked) == 1:
-        return _asked(model, asked[0])
-    needs, places = [], [float(decisions.away[decisions.near == kind].mean()) for kind in (True, False)]
-    for nominal, place in zip(asked, places, strict=True):
-        thresholds, slopes = _needs(model, nominal)
-        needs.append(np.minimum(thresholds + slopes * place, 1))
-    slopes = (needs[1] - needs[0]) / (places[1] - places[0])
-    return _with_needs(model, needs[0] - slopes * places[0], slopes)
+
+    def at_a_photo(slopes: Float[np.ndarray, " G"]) -> list[Float[np.ndarray, " G"]]:
+        return [quantile(one.needs - slopes[:, None] * one.away) for one, quantile in of_kinds]
+
+    if len(of_kinds) == 1:
+        slopes = np.maximum(np.interp(TARGETS, model.calibration.targets, model.calibration.slopes), 0)
+        return _with_needs(model, *at_a_photo(slopes), slopes)
+    low, high = np.zeros(len(TARGETS)), np.full(len(TARGETS), _STEEPEST)
+    for _ in range(_HALVINGS):
+        slopes = (low + high) / 2
+        near, off = at_a_photo(slopes)
+        low, high = np.where(off > near, slopes, low), np.where(off > near, high, slopes)
+    return _with_needs(model, np.maximum(*at_a_photo(low)), low)
 
 
 def hold_all_categories(
@@ -397,7 +436,7 @@ def hold_all_categories(
     for label in models:
         if not (views := len(trial.views(label))):
             continue
-        asked[label] = _empirical(trial.critical(label), confidence)
+        asked[label] = _empirical(trial.decisions(label).critical, confidence)
         if views < fewest_views(confidence):
             continue
         chance = views * (1 - confidence) + _NOISE_SIGMAS * np.sqrt(views * confidence * (1 - confidence))
@@ -435,20 +474,35 @@ def calibrated(
         of all categories and of its own: "uncalibrated".
     """
     fewest, stricter = fewest_views(confidence), 1 - _OF_MISSES * (1 - confidence)
-    decisions = {label: trial.decisions(label) for label in models}
+    least = np.where(held, TARGETS, -np.inf)[:, None]
+    decisions = {}
+    for label, model in models.items():
+        own = trial.decisions(label)
+        nominal = replace(own, critical=np.maximum(own.critical, least))
+        # of a target that is held as much as it needs by itself
+        needs = np.where(held[:, None], np.maximum(own.needs, nominal.for_model(model).needs), own.needs)
+        decisions[label] = replace(nominal, needs=needs)
 
-    def conformal(label: int, kind: bool | None) -> Float[np.ndarray, " G"]:
-        of_others = [one.at(kind) for other, one in decisions.items() if other != label]
-        others = np.hstack([np.zeros((len(TARGETS), 0)), *of_others])
-        rows = list(zip(decisions[label].at(kind), others, strict=True))
-        values = np.full(len(TARGETS), np.inf)
+    def conformal(label: int, kind: bool | None) -> tuple[Decisions, Callable[[np.ndarray], np.ndarray]]:
+        own = decisions[label].of(kind)
+        others = [one.of(kind).for_model(models[label]) for other, one in decisions.items() if other != label]
         # off the path, and from too few viewpoints, as strict as promised
-        for share in (confidence,) if kind is False else (stricter, confidence):
-            if np.isinf(values).any():
-                values = np.array([conformal_quantile(own, share, other) for own, other in rows])
-        return np.where(held, np.maximum(values, TARGETS), values)
+        shares = (confidence,) if kind is False else (stricter, confidence)
 
-    asked = {label: conformal(label, None) for label, one in decisions.items() if len(one.away) >= fewest}
+        def quantile(of_views: Float[np.ndarray, "G m"]) -> Float[np.ndarray, " G"]:
+            n, found = len(own.away), np.full(len(of_views), np.inf)
+            for share in shares:
+                if np.isinf(found).any():
+                    found = conformal_quantile(of_views[:, :n], share, of_views[:, n:])
+            return found
+
+        return own.joined(others), quantile
+
+    enough = [label for label, one in decisions.items() if len(one.away) >= fewest]
+    asked = {}
+    for label in enough:
+        every, quantile = conformal(label, None)
+        asked[label] = quantile(every.critical)
     # nothing is known below the last level where not even one category could be calibrated
     widest = np.max([*asked.values()], axis=0) if asked else np.ones(len(TARGETS))
     found = {}
@@ -456,7 +510,7 @@ def calibrated(
         mine = decisions[label]
         views = len(mine.away)
         if label in asked:
-            made = _by_place(model, mine, [conformal(label, kind) for kind in mine.kinds(fewest)])
+            made = _by_place(model, [conformal(label, kind) for kind in mine.kinds(fewest)])
         else:
             made = _asked(model, np.maximum(widest, mine.critical.max(1)) if views else widest)
         status = "calibrated" if label in asked else "uncalibrated"

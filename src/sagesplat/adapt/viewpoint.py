@@ -100,11 +100,11 @@ class Calibration:
 
     def needed(
         self,
-        target: float,
+        target: float | Float[np.ndarray, "*t V"],
         away: Float[np.ndarray, " V"],
         strictness: Float[np.ndarray, " V"] | float = 1.0,
         most: Float[np.ndarray, " V"] | float = np.inf,
-    ) -> Float[np.ndarray, " V"]:
+    ) -> Float[np.ndarray, "*t V"]:
         """The mean from which on a target is kept (arguments: `bound`); inf: no level keeps it.
 
         Between targets it is interpolated.
@@ -112,7 +112,14 @@ class Calibration:
         if not len(self.targets):
             return np.full(len(away), np.nan)
         known = self._needed(away, strictness, most)
-        found = np.array([np.interp(target, self.targets, row, right=np.inf) for row in known])
+        target = np.broadcast_to(target, np.broadcast_shapes(np.shape(target), away.shape))
+        found = np.array(
+            [
+                np.interp(one, self.targets, row, right=np.inf)
+                for one, row in zip(np.moveaxis(target, -1, 0), known, strict=True)
+            ]
+        )
+        found = np.moveaxis(found.reshape(len(known), *target.shape[:-1]), 0, -1)
         return np.where(target < self.targets[0], known[:, 0] - (self.targets[0] - target), found)
 
     def _needed(
