@@ -688,13 +688,13 @@ def test_full_and_adapted_side_by_side(site: str, browser: Any) -> None:
         opened.page.evaluate("sagesplat.set({ mode: 'base' })")
         opened.page.evaluate("sagesplat.goTo(0)")
         before = settled(opened)
+        opened.page.evaluate(WATCH)
         opened.page.keyboard.press("c")
-        for _ in range(100):  # until the full scene is there
-            both = settled(opened)
-            if np.abs(both[:, :140] - before[:, :140]).mean() > 0.01:
-                break
-        else:
-            raise AssertionError("the full scene is not shown")
+        opened.wait_for("document.querySelector('.split').checkVisibility()")  # the full scene is there
+        both = settled(opened)
+        assert np.abs(both[:, :140] - before[:, :140]).mean() > 0.01
+        left = opened.page.evaluate("samples.map((s) => s.half[0])")
+        assert min(left) > 0.8 * left[0] > 0  # the adapted one was shown until then
         assert np.abs(both[:, 180:] - before[:, 180:]).mean() < 0.004
         assert opened.page.evaluate("sagesplat.state().count") == BASE
         opened.page.keyboard.press("c")

@@ -132,7 +132,7 @@ export interface State {
   readonly status: "loading" | "ok" | "infeasible" | "over budget";
   readonly bytesLoaded: number; // total downloaded
   readonly bytesShown: number;
-  readonly gpuBytes: number; // of all decoded increments, shown or not
+  readonly gpuBytes: number; // of what the GPU has: all that is drawn, and what is kept above it
   readonly count: number; // shown
   readonly bandwidth: number; // bytes per second, measured; NaN: unknown
   readonly pending: number; // downloads

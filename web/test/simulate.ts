@@ -301,6 +301,7 @@ export const digest = async (bytes: Uint8Array): Promise<string> => fnv(bytes);
 export class FakeRenderer implements Renderer {
   readonly drawn = new Set<Handle>();
   readonly alive = new Set<Handle>();
+  readonly uploaded = new Map<number, readonly Handle[]>(); // by cell: what is drawn, and what was drawn above it
   decoded = 0;
   swaps: { show: readonly Handle[]; hide: readonly Handle[] }[] = [];
   readonly corrupt = new Set<string>(); // "cell/level" that cannot be decoded
@@ -347,6 +348,11 @@ export class FakeRenderer implements Renderer {
       if (this.drawn.has(handle)) throw new Error("shows what is drawn");
       this.drawn.add(handle);
     }
+    for (const { cell } of [...show, ...hide]) {
+      const before = this.uploaded.get(cell) ?? [];
+      const now = this.drawnOf(cell);
+      if (!now.every((handle, i) => handle === before[i])) this.uploaded.set(cell, now);
+    }
     this.swaps.push({ show, hide });
     this.watch();
   }
@@ -354,10 +360,16 @@ export class FakeRenderer implements Renderer {
   dispose(handle: Handle): void {
     if (this.drawn.has(handle)) throw new Error("disposes of what is drawn");
     if (!this.alive.delete(handle)) throw new Error("disposes twice");
+    const { cell } = handle;
+    if (this.uploaded.get(cell)?.includes(handle)) this.uploaded.set(cell, this.drawnOf(cell));
   }
 
   /** Levels drawn of a cell, ascending. */
   levels(cell: number): number[] {
-    return [...this.drawn].flatMap((h) => (h.cell === cell ? [h.level] : [])).sort((a, b) => a - b);
+    return this.drawnOf(cell).map(({ level }) => level);
+  }
+
+  private drawnOf(cell: number): Handle[] {
+    return [...this.drawn].filter((h) => h.cell === cell).sort((a, b) => a.level - b.level);
   }
 }

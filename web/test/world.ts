@@ -78,10 +78,10 @@ function watcher(streamer: Streamer, renderer: FakeRenderer): () => void {
   const seen = new Set<number>(); // cells
   const { live } = streamer.manifest; // there the old may be drawn for the new
   return () => {
-    const { labels, count } = streamer.state;
+    const { labels, count, gpuBytes } = streamer.state;
     const all = labels.flatMap(({ cells }) => cells);
     for (const id of seen) if (!all.some(({ cell }) => cell.id === id)) seen.delete(id);
-    let drawn = 0;
+    let [drawn, uploaded] = [0, 0];
     for (const { cell, shown, wanted } of all) {
       const levels = renderer.levels(cell.id);
       const start = cell.levels.slice(0, shown).findLastIndex(({ refine }) => refine);
@@ -93,8 +93,11 @@ function watcher(streamer: Streamer, renderer: FakeRenderer): () => void {
       if (seen.has(cell.id) && wanted && !shown) throw new Error(`cell ${cell.id}: a hole`);
       if (shown) seen.add(cell.id);
       else if (!wanted) seen.delete(cell.id); // left out, since the budget is that small
+      const there = renderer.uploaded.get(cell.id) ?? [];
+      uploaded += there.reduce((sum, { level }) => sum + (cell.levels[level - 1]?.gpuBytes ?? 0), 0);
       drawn += cell.levels.reduce((sum, file, i) => sum + (isDrawn(i) ? file.count : 0), 0);
     }
+    if (!live && uploaded !== gpuBytes) throw new Error(`says ${gpuBytes} bytes, the GPU has ${uploaded}`);
     if (!live && drawn !== count) throw new Error(`counts ${count}, draws ${drawn}`);
   };
 }

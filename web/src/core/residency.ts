@@ -26,6 +26,7 @@ export class Entry {
   around = 0; // level once everything in sight is drawn as planned
   wanted = 0; // one of the two, or on the way between
   shown = 0;
+  uploaded = 0; // level whose increments the GPU has: those above the drawn one stay there
   decoding = 0; // level being decoded, 0: none
   former: Drawn | null = null;
   readonly points: Points;
@@ -141,9 +142,23 @@ export class Entry {
     return this.decoded.slice(from, to).filter((handle) => handle !== undefined);
   }
 
-  /** GPU bytes of all decoded increments, including replaced ones that are still drawn. */
+  /** Takes note of what is drawn now: a level that replaces others, or is below such, takes their place on the GPU. */
+  show(level: number): void {
+    this.shown = level;
+    if (!level) return; // the GPU keeps what was drawn
+    const stays = this.start(level) === this.start(this.uploaded);
+    this.uploaded = stays ? Math.max(level, this.uploaded) : level;
+  }
+
+  /** Takes note that an increment that is not drawn is disposed of: if the GPU has it, only what is drawn stays there. */
+  dispose(level: number): void {
+    this.decoded[level - 1] = undefined;
+    if (level > this.start(this.uploaded) && level <= this.uploaded) this.uploaded = this.shown;
+  }
+
+  /** Bytes on the GPU, including replaced increments that are still drawn; what else is decoded is in main memory. */
   get gpuBytes(): number {
-    const own = this.cell.levels.reduce((sum, file, i) => sum + (this.decoded[i] ? file.gpuBytes : 0), 0);
+    const own = this.ladder.gpuBytes[this.uploaded - 1] ?? 0;
     return own + (this.former ? gpuBytesOf(this.former) : 0);
   }
 }
@@ -233,7 +248,7 @@ export class Hidden {
     for (const [handle, { entry }] of this.kept) {
       if (this.bytes <= limit) return;
       this.remove(handle);
-      entry.decoded[handle.level - 1] = undefined;
+      entry.dispose(handle.level);
       this.renderer.dispose(handle);
     }
   }
@@ -263,7 +278,7 @@ export function settle(
     hide.push(...former);
     // the top level first, so that it is disposed of first
     for (const handle of former.reverse()) hidden.add(e, handle);
-    e.shown = level;
+    e.show(level);
     if (e.former || e.replaces) keepOthers(e, hidden);
     gone.push(...(e.former?.handles ?? []));
     e.former = null;

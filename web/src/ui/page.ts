@@ -73,8 +73,8 @@ export function buildPage(app: HTMLElement, viewer: Viewer): void {
 }
 
 function sentence(viewer: Viewer, done: boolean): string {
-  const { state, compare } = viewer;
-  if (compare.on && compare.progress < 1)
+  const { state, compare, stage } = viewer;
+  if (compare.on && (compare.progress < 1 || !stage.isSplit))
     return `Loading the full scene, ${Math.floor(compare.progress * 100)} %`;
   if (state.status === "over budget") return "The lowest levels exceed the budget";
   if (state.status === "infeasible") return shortfall(state, viewer.settings);

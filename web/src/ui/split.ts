@@ -33,14 +33,19 @@ export function splitSlider(viewer: Viewer): Split {
     viewer.stage.invalidate();
   }
 
+  function update(): void {
+    element.hidden = !viewer.stage.isSplit;
+    element.classList.toggle("off", viewer.headset.session !== null);
+  }
+
   return {
     element,
     toggle: () => {
       if (viewer.compare.on) viewer.compare.stop();
       else viewer.startCompare();
-      element.hidden = !viewer.compare.on;
+      update();
       move();
     },
-    update: () => element.classList.toggle("off", viewer.headset.session !== null),
+    update,
   };
 }

@@ -100,6 +100,16 @@ export class SparkLayer implements Renderer {
     return !sorting && !sortDirty && display === current;
   }
 
+  /** Whether all that is shown is in the picture: what has come since is sorted later. */
+  get isCurrent(): boolean {
+    const sorted = new Map<unknown, number>(
+      this.spark.display.mapping.map(({ node, count }) => [node, count]),
+    );
+    return [...this.#columns.values()].every(
+      ({ mesh, source }) => !mesh.visible || source.count === (sorted.get(mesh) ?? 0),
+    );
+  }
+
   /** Sets the similarity from the bundle's frame to the scene. */
   place(matrix: Matrix4): void {
     matrix.decompose(this.root.position, this.root.quaternion, this.root.scale);

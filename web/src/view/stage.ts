@@ -26,6 +26,7 @@ export class Stage {
   readonly layer: SparkLayer;
   readonly root: Matrix4; // from the bundle's frame to the camera's world
   full: SparkLayer | null = null;
+  isSplit = false; // whether the full scene is shown; until it is ready the adapted one has the whole canvas
   split = 0.5; // share of the width that shows the full scene
   needsFrame = true;
   /** What is behind all that is drawn while something in sight is missing: the scene's mean colour. */
@@ -47,8 +48,8 @@ export class Stage {
     this.layer = this.newLayer();
   }
 
-  newLayer(): SparkLayer {
-    return new SparkLayer(this.renderer, this.manifest, () => this.invalidate());
+  newLayer(onDirty: () => void = () => this.invalidate()): SparkLayer {
+    return new SparkLayer(this.renderer, this.manifest, onDirty);
   }
 
   invalidate(): void {
@@ -141,7 +142,7 @@ export class Stage {
     const view = this.viewpoint();
     for (const layer of [this.layer, this.full]) layer?.cull(view);
     if (this.#holds(view, mayHold && !renderer.xr.isPresenting)) return false;
-    if (!this.full || renderer.xr.isPresenting) {
+    if (!this.full || !this.isSplit || renderer.xr.isPresenting) {
       renderer.render(this.layer.scene, camera);
       return true;
     }
@@ -158,7 +159,8 @@ export class Stage {
 
   /** Whether the earlier frame stays, while the next one is sorted. */
   #holds(view: Viewpoint, may: boolean): boolean {
-    const late = [this.layer, this.full].filter((layer) => layer?.misses(view));
+    const layers = [this.layer, this.isSplit ? this.full : null];
+    const late = layers.filter((layer) => layer?.misses(view));
     if (!late.length) {
       this.#heldSince = Number.NaN;
       return false;

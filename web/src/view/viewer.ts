@@ -144,7 +144,7 @@ export class Viewer {
 
   /** Shows the full scene beside the adapted one, with the same tint and hidden labels. */
   startCompare(): void {
-    this.compare.start(() => this.stage.invalidate());
+    this.compare.start();
     for (const label of this.#hidden) this.stage.full?.setVisible(label, false);
     this.setTint(this.#tint, this.#shaded);
   }
@@ -245,6 +245,7 @@ export class Viewer {
     stage.isIncomplete = this.state.labels.some(({ cells }) =>
       cells.some((cell) => cell.visible && !cell.shown),
     );
+    this.compare.update();
     const isDrawn = stage.draw(true);
     this.streamer.update(stage.viewpoint());
     if (!isDrawn) return;

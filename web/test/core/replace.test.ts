@@ -61,8 +61,19 @@ test("above a level that replaces, the first comes first, and those between are 
   }
   const { count, bytesShown, gpuBytes } = w.streamer.state;
   expect([count, bytesShown]).toEqual([w.manifest.totals.count, w.manifest.totals.bytes]);
-  const first = w.manifest.labels.reduce((sum, label) => sum + (label.cells[0]?.levels[0]?.gpuBytes ?? 0), 0);
-  expect(gpuBytes).toBe(w.manifest.totals.gpuBytes + first); // in memory, for the way back
+  expect(gpuBytes).toBe(w.manifest.totals.gpuBytes); // without the first level
+  expect(w.renderer.alive.size).toBe(3 * 3); // which stays in memory, for the way back
+});
+
+test("what is shown in full for a while is as before afterwards, also on the GPU", async () => {
+  const w = await started("target", { replaces: [5] });
+  const { count, bytesShown, gpuBytes } = w.streamer.state;
+  expect(count).toBeLessThan(w.manifest.totals.count);
+  await w.run({ always: new Map(w.manifest.labels.map(({ id }) => [id, true])) }); // labels are edited
+  expect(w.streamer.state.count).toBe(w.manifest.totals.count);
+  expect(w.streamer.state.gpuBytes).toBe(w.manifest.totals.gpuBytes);
+  await w.run({ always: new Map() });
+  expect(w.streamer.state).toMatchObject({ count, bytesShown, gpuBytes });
 });
 
 test("a stream that replaces those below needs nothing of theirs", async () => {
