@@ -8,7 +8,7 @@ from typing import Any, TypeVar, get_args
 
 from sagesplat.core import config
 from sagesplat.core.limits import NotNegative, Seed
-from sagesplat.io.files import write_json
+from sagesplat.io.files import write_text
 from sagesplat.io.typed import convert_as, known_json
 from sagesplat.run.records import FORMAT
 from sagesplat.run.run_dir import RunDir
@@ -67,7 +67,7 @@ def write_begun(run: RunDir, asked: config.RunConfig, adopt: config.AdoptConfig 
     names = ("train", "clean", "nest", "sample", "fit", "plan")
     settings = {name: asdict(getattr(asked, name)) | {"seed": asked.seed} for name in names}
     settings |= {"adopt": asdict(adopt)} if adopt else {}
-    write_json(run.begun, json.loads(json.dumps(settings, default=str)))
+    write_text(run.begun, json.dumps(settings, default=str))
 
 
 def _labels(run: RunDir) -> dict[str, Any]:
