@@ -40,7 +40,7 @@ _SOME = 100  # that tell how many pixels viewpoints have
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
 # Times as many to calibrate on where there is one category: no others count as some of its own
-_ALONE = 2
+_ALONE = 1.5
 
 
 def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
@@ -99,7 +99,7 @@ def _counts(job: Job, config: SampleConfig, pixels: float) -> dict[str, int]:
         more = int(np.clip(left // cost[name], 0, MOST[name] - counts[name]))
         counts[name], left = counts[name] + more, left - more * cost[name]
     if len(np.unique(job.cells.labels)) == 1:
-        counts["calibration"] = min(_ALONE * counts["calibration"], MOST["calibration"])
+        counts["calibration"] = min(int(_ALONE * counts["calibration"]), MOST["calibration"])
     counts["fit"] = config.views or counts["fit"]
     counts["calibration"] = config.calibration_views or counts["calibration"]
     return counts
