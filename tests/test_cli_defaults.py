@@ -4,6 +4,7 @@ import importlib.util
 import json
 import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,6 +28,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, StageSkipped, Training, Warned
 from sagesplat.formats.levels import read_level
 from sagesplat.io.files import read_json
+from sagesplat.io.lock import locked
 from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings, write_begun
 from sagesplat.run.run_dir import RunDir
@@ -141,6 +143,25 @@ def test_a_run_that_did_not_end_has_its_settings(tmp_path: Path) -> None:
     assert "adopt" not in known  # there is no splat yet
     run.begun.write_text("{")
     assert "nest" not in recorded_settings(run)
+
+
+def test_settings_of_a_run_are_kept_until_it_ends(
+    run: Path, capture: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    begun, written = RunDir(run).begun, []
+    monkeypatch.setattr(pipeline, "write_begun", lambda *asked: written.append(asked))
+    assert command("run", capture, run)[0] == 0
+    assert not written  # a finished run is only read
+    monkeypatch.undo()
+    assert command("run", capture, run, "--target-ssim", "0.5", "--force")[0] == 0
+    assert not begun.exists()
+    RunDir(run, "snapshots").provenance("report").unlink()
+    with locked(run):
+        said = subprocess.run(
+            [sys.executable, "-m", "sagesplat", "run", str(capture), str(run)], capture_output=True, text=True
+        )
+    assert said.returncode == 2
+    assert not begun.exists()  # another process works there
 
 
 def test_a_refusal_says_what_differs_and_its_cure_works(run: Path, command: Call) -> None:

@@ -19,6 +19,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Emit, Progress, StageDone, StageStarted
 from sagesplat.demo.capture import cached_capture
 from sagesplat.demo.wild import EVERYTHING, NOTHING, Wild
+from sagesplat.io.lock import locked
 from sagesplat.io.typed import check_limits
 from sagesplat.run.job import Job
 from sagesplat.run.recorded import write_begun
@@ -72,7 +73,7 @@ def run_all(job: Job, scene: Path, config: RunConfig) -> None:
     blocks.check(config.blocks, config.train)
     check_segmenter(job, scene, config.masks)
     open_scene(job, scene, config.scene, config.poses, config.masks, config.labels)
-    write_begun(job.run, config)
+    _remember(job, config)
     if config.blocks.count == 1:
         check_training(job, config.train)
     make_masks(job, config.masks, config.labels)
@@ -102,11 +103,18 @@ def adopt(job: Job, source: Path, adopted: AdoptConfig, config: RunConfig) -> No
     _check_limits(config)
     check_targets(config.plan, "nested")
     open_splat(job, source, adopted, config.scene, config.masks, config.labels)
-    write_begun(job.run, config, adopted)
+    _remember(job, config, adopted)
     method_of(job).check(config.plan)
     make_levels(job, adopted)
     measure_and_plan(job, config)
     job.run.begun.unlink(missing_ok=True)
+
+
+def _remember(job: Job, config: RunConfig, adopted: AdoptConfig | None = None) -> None:
+    """Keep settings for stages that a killed run does not reach; the records of a finished one have them."""
+    if job.force or not job.run.provenance("report").exists():
+        with locked(job.run.path, job.lock_wait):
+            write_begun(job.run, config, adopted)
 
 
 def _check_limits(config: RunConfig) -> None:
