@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int16, Int32
+from jaxtyping import Bool, Float, Float32, Int, Int16, Int32, UInt16
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
 from sagesplat.adapt.observe import RenderedLabels, render_rgb
@@ -27,7 +27,8 @@ from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 
-_KEEP = 2 * 10**8  # bytes of the full model's pictures that are kept
+_KEEP = 6 * 10**8  # bytes of the full model's pictures that are kept: plans look where models were fitted
+_STEPS = np.float32(2**16 - 1)  # of colours in them: half the memory, and SSIM is the same to 3e-6
 _SEEN_BYTES = 44  # of a Gaussian in what its levels are rendered from
 _KEEP_LEVELS = 10**8  # of what levels are rendered from: for many Gaussians it takes as much as 20 pictures
 PROMISED_SHARE = 2e-3  # of a picture that a category has to cover: of fewer pixels nothing is promised
@@ -180,16 +181,21 @@ def measure_compositions(
 class Reference:
     """The full model from one viewpoint, and what its levels are composed of there."""
 
-    image: Float32[np.ndarray, "H W 3"]
+    colours: Float32[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"]  # in [0, 1], or steps of that
     label_ids: Int16[np.ndarray, "H W"]
     pixels: Int32[np.ndarray, " L"]  # of each label, ascending
     levels: Seen | None  # None: those of the ladder
     tile_mask: Bool[np.ndarray, "h w"] | None  # where wanted categories are; None: all are wanted
 
+    @cached_property
+    def image(self) -> Float32[np.ndarray, "H W 3"]:
+        """Colours in [0, 1]."""
+        return self.colours if self.colours.dtype == np.float32 else self.colours / _STEPS
+
     @property
     def nbytes(self) -> int:
-        """Memory that it holds besides the levels, about."""
-        return self.image.nbytes + self.label_ids.nbytes
+        """Memory that it holds besides the levels and `image`, about."""
+        return self.colours.nbytes + self.label_ids.nbytes
 
 
 class References:
@@ -211,6 +217,7 @@ class References:
         self.labels = sorted({label for label, _ in ladder.counts})
         self.wanted = np.array([only is None or label in only for label in self.labels])
         self._ladder, self._antialiased = ladder, antialiased
+        self._exact = keep == 0
         self._left, self._left_levels = keep, min(keep, _KEEP_LEVELS)
         self._backend: Backend = backend
         self._given = full
@@ -248,8 +255,8 @@ class References:
             stays = compositions is None and found.levels and found.levels.nbytes <= self._left_levels
             if found.levels and stays:
                 self._left_levels -= found.levels.nbytes
-            self._kept[key] = found if stays else replace(found, levels=None)
-        return found
+            self._kept[key] = replace(found, levels=found.levels if stays else None)
+        return replace(found)  # what is kept stays without `image`
 
     def _seen(
         self,
@@ -278,7 +285,9 @@ class References:
         image = self._full.paint(camera, tile_mask) if image is None else image
         counts = np.bincount(label_ids.ravel().astype(np.int64) - UNLABELLED, minlength=2 + max(self.labels))
         pixels = counts[np.array(self.labels) - UNLABELLED].astype(np.int32)
-        return Reference(image, label_ids, pixels, levels, tile_mask)
+        # what is kept is the same whenever it is looked at
+        colours = image if self._exact else np.rint(image * _STEPS).astype(np.uint16)
+        return Reference(colours, label_ids, pixels, levels, tile_mask)
 
     def compare(
         self, levels: Mapping[int, int], camera: Camera, at: Reference
