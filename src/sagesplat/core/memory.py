@@ -1,6 +1,8 @@
 """Memory that runs out, in whatever words: Python's, numpy's, torch's, onnxruntime's or the loader's."""
 
+import ctypes
 import errno
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -44,3 +46,9 @@ def named_memory(where: str) -> Iterator[None]:
         if ran_out(error):
             raise OutOfMemory(f"{where}: out of memory; {MORE}") from error
         raise
+
+
+def return_freed() -> None:
+    """Give freed memory back to the system: glibc keeps it, of a million Gaussians up to 0.9 GB."""
+    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
+        trim(0)

@@ -28,24 +28,24 @@ def side_by_side(function: Callable[[Item], Result], items: Sequence[Item]) -> I
     It takes as many threads as kernels otherwise would. `function` must not change what other calls read.
     """
     threads = min(numba.get_num_threads(), max(len(items) - 1, 1))
-    if items:
-        yield function(items[0])  # by itself: kernels are compiled, and numba starts its threads
-    if threads == 1 or not _concurrent():
-        yield from map(function, items[1:])
+    if threads == 1:
+        yield from map(function, items)
         return
-    of_torch = torch.get_num_threads()
-    pool = ThreadPoolExecutor(threads, initializer=_limit, initargs=(numba.get_num_threads() // threads,))
+    each, of_torch = numba.get_num_threads() // threads, torch.get_num_threads()
+
+    def one_of_several(item: Item) -> Result:
+        numba.set_num_threads(each)
+        torch.set_num_threads(each)
+        return function(item)
+
+    pool = ThreadPoolExecutor(threads)
     try:
-        yield from pool.map(function, items[1:])
+        # by itself: kernels are compiled, and numba starts its threads; its `Workspace` serves later items
+        yield pool.submit(function, items[0]).result()
+        yield from pool.map(one_of_several, items[1:]) if _concurrent() else map(function, items[1:])
     finally:
         pool.shutdown(cancel_futures=True)
         torch.set_num_threads(of_torch)  # what later threads begin with
-
-
-def _limit(threads: int) -> None:
-    """Kernels and torch take so many threads when this one calls them."""
-    numba.set_num_threads(threads)
-    torch.set_num_threads(threads)
 
 
 def _concurrent() -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 
 from sagesplat.core.errors import RunError
 from sagesplat.core.events import StageDone, StageSkipped, StageStarted
-from sagesplat.core.memory import named_memory
+from sagesplat.core.memory import named_memory, return_freed
 from sagesplat.io.files import named_full_disk, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
 from sagesplat.run.job import NO_RUN, Job
@@ -79,6 +79,7 @@ def run_stages(
             if not stages[number].swaps:
                 job.run.provenance(stages[number].name).unlink(missing_ok=True)
             job.emit(StageStarted(stages[number].name))
+        return_freed()
         begin, since = time.perf_counter(), time.time() - _CLOCK_STEP
         for number, lines in make(missing):
             stage = stages[number]
