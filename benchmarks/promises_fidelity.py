@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs
+from sagesplat.adapt.calibrate_fidelity import plan_nominal
 from sagesplat.adapt.cell_models import Expected, needed
 from sagesplat.adapt.cell_plans import reach
 from sagesplat.adapt.fidelity import SampledFidelity, shown_enough
-from sagesplat.adapt.fidelity_models import plan_nominal
 from sagesplat.adapt.viewpoints import capture_cameras, draw
 from sagesplat.run.job import Job
 from sagesplat.scene.scene import Camera

@@ -6,23 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sagesplat.adapt.cell_models import expect, needed, promised, read_fidelity, write_fidelity
-from sagesplat.adapt.cells import POINTS, STEPS, Cells
-from sagesplat.adapt.fidelity import SampledFidelity, pooled_cells, read_sampled, write_sampled
-from sagesplat.adapt.fidelity_models import (
-    MOST_INDUCING,
-    MOST_PHOTOS,
+from sagesplat.adapt.calibrate_fidelity import (
     NOMINAL,
     TARGETS,
     Trial,
     calibrated,
-    fit_fidelity,
     hold_all_categories,
-    photo_places,
     plan_nominal,
     remove_composition_bias,
     trial_of,
 )
+from sagesplat.adapt.cell_models import expect, needed, promised, read_fidelity, write_fidelity
+from sagesplat.adapt.cells import POINTS, STEPS, Cells
+from sagesplat.adapt.fidelity import SampledFidelity, pooled_cells, read_sampled, write_sampled
+from sagesplat.adapt.fidelity_models import MOST_INDUCING, MOST_PHOTOS, fit_fidelity, photo_places
 from sagesplat.adapt.viewpoint import Calibration, away_from, where
 from sagesplat.core.errors import DataError
 from sagesplat.scene.scene import Camera

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.runtime.measure import Shown
+from sagesplat.adapt.cell_models import needed
 from sagesplat.adapt.cell_plans import reach, within
 from sagesplat.adapt.fidelity import References
-from sagesplat.adapt.fidelity_models import needed
 from sagesplat.adapt.fill import fill
 from sagesplat.formats.increments import shown
 from sagesplat.run.job import Job

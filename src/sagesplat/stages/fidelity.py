@@ -5,20 +5,20 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from sagesplat.adapt.bound_plans import Costs
-from sagesplat.adapt.cell_models import FidelityModel, expect
-from sagesplat.adapt.cells import Cells
-from sagesplat.adapt.fidelity import measure_compositions, pooled_cells, shown_enough
-from sagesplat.adapt.fidelity_models import (
+from sagesplat.adapt.calibrate_fidelity import (
     NOMINAL,
     NOTHING_HELD,
     Trial,
     calibrated,
-    fit_fidelity,
     hold_all_categories,
     plan_nominal,
     remove_composition_bias,
     trial_of,
 )
+from sagesplat.adapt.cell_models import FidelityModel, expect
+from sagesplat.adapt.cells import Cells
+from sagesplat.adapt.fidelity import measure_compositions, pooled_cells, shown_enough
+from sagesplat.adapt.fidelity_models import fit_fidelity
 from sagesplat.adapt.viewpoints import capture_cameras
 from sagesplat.core.config import FitConfig
 from sagesplat.core.events import Progress

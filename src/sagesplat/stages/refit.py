@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from sagesplat.adapt.calibrate_fidelity import calibrated, remove_composition_bias
 from sagesplat.adapt.cell_models import FidelityModel, write_fidelity
 from sagesplat.adapt.eq3 import write_models
-from sagesplat.adapt.fidelity_models import calibrated, fit_fidelity, remove_composition_bias
+from sagesplat.adapt.fidelity_models import fit_fidelity
 from sagesplat.adapt.regroup import NewCell
 from sagesplat.adapt.viewpoint import write_promises
 from sagesplat.adapt.viewpoints import capture_cameras

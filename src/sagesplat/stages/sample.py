@@ -5,9 +5,10 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
+from sagesplat.adapt.calibrate_fidelity import NOMINAL
 from sagesplat.adapt.cells import look
 from sagesplat.adapt.fidelity import SampledFidelity, measure_levels, write_sampled
-from sagesplat.adapt.fidelity_models import NOMINAL, fit_fidelity
+from sagesplat.adapt.fidelity_models import fit_fidelity
 from sagesplat.adapt.viewpoints import (
     Rule,
     Viewpoints,
