@@ -314,6 +314,8 @@ def test_other_folders_are_left_alone(run: Path, viewer: Path, tmp_path: Path) -
         edited(run, viewer, Rename(CAR, "auto"))
     with pytest.raises(RunError, match="the run itself"):
         apply_labels(job_of(run), out=run, viewer=viewer)
+    with pytest.raises(RunError, match="not a run folder"):
+        apply_labels(job_of(tmp_path / "run-edited"), viewer=viewer)
 
 
 @pytest.mark.slow

@@ -4,8 +4,9 @@ Each composition is compared with the photo, over the pixels of the photo's labe
 model rendered from the same viewpoint, over the pixels that the full model's Gaussians paint.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import get_args
 
@@ -143,84 +144,121 @@ def evaluate(
     Returns:
         One row per (plan, view, category), one per (plan, view) and one per (level, view) for the full image.
     """
-    rows: list[dict[str, float]] = []
-    views = valid.rows(scene, scene.test_ids)
-    inner = {row: erode(masks[scene.views[row]]) for row in views}
-    done, total = 0, len(views) * (1 + len(plans) + len(uniform))
-    workspace = Workspace()
     last = ladder.load(ladder.levels[-1]).to(device_of(backend))
     origin = last if full is None else full.to(device_of(backend))
-    labels, kept, size = RenderedLabels(last, backend, antialiased), {}, 0
-
-    def render(g: Gaussians, camera: Camera) -> np.ndarray:
-        return render_rgb(g, camera, backend=backend, antialiased=antialiased, workspace=workspace)
-
+    views = _TestViews(scene, photos, masks, valid, last, origin, backend, antialiased)
     others = {"ms_ssim": ms_ssim} if others is None else others
+    done, total = 0, len(views.rows) * (1 + len(plans) + len(uniform))
 
-    def measure_all(g: Gaussians, further: Mapping[str, Similarity]):
+    def measured(g: Gaussians, further: Mapping[str, Similarity]) -> Iterator[_InView]:
         nonlocal done
-        g = g.to(device_of(backend))
-
-        def in_view(row: int):
-            nonlocal size
-            view, photo = scene.views[row], as_unit(photos[row])
-            neutral = view.camera.neutral  # fidelity is promised of pictures without a photo's exposure
-            if row not in kept:
-                reference = render(origin, neutral)
-                size += reference.nbytes
-                if size <= KEPT:
-                    kept[row] = reference
-            else:
-                reference = kept[row]
-            image = reference if g is origin else render(g, neutral)
-            least = PROMISED_SHARE * image.shape[0] * image.shape[1]
-            fidelity = fidelity_by_label(image, reference, labels[view], least)
-            # of levels beside the plans only SSIM and PSNR are kept
-            colours = measure_colours(image, photo, valid[view]) if further else {}
-            if view.camera.exposure is not None:
-                image = render(g, view.camera)
-            measured = measure(image, photo, masks[view], inner[row], valid[view])
-            against = pasted(photo, image, valid[view])
-            measured[TOTAL] |= {**colours, **{name: of(image, against) for name, of in further.items()}}
-            return row, measured, fidelity
-
-        for found in each_view(in_view, views, device_of(backend)):
+        for found in views.measure(g, further):
             yield found
             done += 1
             if progress:
                 progress(done, total)
 
-    of_last = {row: measured for row, measured, _ in measure_all(last, others)}
+    rows: list[dict[str, float]] = []
+    of_last = {found.row: found.against_photo for found in measured(last, others)}
     for level in uniform:
-        for row, measured, fidelity in measure_all(ladder.load(level), {}):
+        for found in measured(ladder.load(level), {}):
+            values, best = found.against_photo[TOTAL], of_last[found.row][TOTAL]
             rows.append({
                 "quality": QUALITIES.index("fidelity"), "target": np.nan,
-                "view": row, "label_id": UNIFORM, "level": level,
-                "predicted": np.nan, "fidelity": fidelity[TOTAL],
-                "ssim": measured[TOTAL]["ssim"], "psnr": measured[TOTAL]["psnr"],
-                "num_pixels": measured[TOTAL]["num_pixels"],
-                "full_ssim": of_last[row][TOTAL]["ssim"], "full_psnr": of_last[row][TOTAL]["psnr"],
-                **_of_whole({}, {}),
+                "view": found.row, "label_id": UNIFORM, "level": level,
+                "predicted": np.nan, "fidelity": found.fidelity[TOTAL],
+                **_against_photo(values, best), **_of_whole({}, {}),
             })  # fmt: skip
-    known_compositions: dict[str, list[tuple[int, dict[int, dict[str, float]], dict[int, float]]]] = {}
+    known_compositions: dict[str, list[_InView]] = {}
     for plan in plans:
         same = repr((plan.levels, plan.cells, (plan.quality, plan.target) if compose else None))
         if same not in known_compositions:  # low targets often have one plan
             composed = compose(plan) if compose else plan.compose(ladder)
-            known_compositions[same] = list(measure_all(composed, others))
-        for row, measured, fidelity in known_compositions[same]:
-            for label, values in measured.items():
-                level, known = plan.levels.get(label, -1), label in plan.levels
+            known_compositions[same] = list(measured(composed, others))
+        for found in known_compositions[same]:
+            for label, values in found.against_photo.items():
+                best, known = of_last[found.row][label], label in plan.levels
                 rows.append({
                     "quality": QUALITIES.index(plan.quality), "target": plan.target,
-                    "view": row, "label_id": label, "level": level,
-                    "predicted": predicted(plan, label, row) if known else np.nan,
-                    "fidelity": fidelity.get(label, np.nan),
-                    "ssim": values["ssim"], "psnr": values["psnr"], "num_pixels": values["num_pixels"],
-                    "full_ssim": of_last[row][label]["ssim"], "full_psnr": of_last[row][label]["psnr"],
-                    **_of_whole(values, of_last[row][label]),
+                    "view": found.row, "label_id": label, "level": plan.levels.get(label, -1),
+                    "predicted": predicted(plan, label, found.row) if known else np.nan,
+                    "fidelity": found.fidelity.get(label, np.nan),
+                    **_against_photo(values, best), **_of_whole(values, best),
                 })  # fmt: skip
     return from_rows(Evaluation, rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _InView:
+    """What Gaussians measure in a test view; of a whole image the label is TOTAL."""
+
+    row: int  # in Scene.views
+    against_photo: dict[int, dict[str, float]]  # by label id and name
+    fidelity: dict[int, float]  # by label id
+
+
+@dataclass(frozen=True, eq=False)
+class _TestViews:
+    """The test views, and the full model's images of them as far as memory allows."""
+
+    scene: Scene
+    photos: Photos
+    masks: LabelImages
+    valid: ValidPixels
+    last: Gaussians  # the last level, whose labels say where fidelity is measured
+    origin: Gaussians  # what fidelity is against
+    backend: Backend
+    antialiased: bool
+    workspace: Workspace = field(default_factory=Workspace)
+    kept: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @cached_property
+    def rows(self) -> list[int]:
+        """Rows of the views that count, in Scene.views."""
+        return self.valid.rows(self.scene, self.scene.test_ids)
+
+    def measure(self, g: Gaussians, further: Mapping[str, Similarity]) -> Iterator[_InView]:
+        """What Gaussians measure in each view; without `further` similarities no other colours either."""
+        device = device_of(self.backend)
+        yield from each_view(partial(self._in_view, g.to(device), further), self.rows, device)
+
+    def _in_view(self, g: Gaussians, further: Mapping[str, Similarity], row: int) -> _InView:
+        view, photo = self.scene.views[row], as_unit(self.photos[row])
+        neutral = view.camera.neutral  # fidelity is promised of pictures without a photo's exposure
+        reference = self.kept[row] if row in self.kept else self._render(self.origin, neutral)
+        if row not in self.kept and (len(self.kept) + 1) * reference.nbytes <= KEPT:
+            self.kept[row] = reference
+        image = reference if g is self.origin else self._render(g, neutral)
+        least = PROMISED_SHARE * image.shape[0] * image.shape[1]
+        fidelity = fidelity_by_label(image, reference, self._labels[view], least)
+        valid = self.valid[view]
+        colours = measure_colours(image, photo, valid) if further else {}
+        if view.camera.exposure is not None:
+            image = self._render(g, view.camera)
+        measured = measure(image, photo, self.masks[view], self._inner[row], valid)
+        against = pasted(photo, image, valid)
+        measured[TOTAL] |= {**colours, **{name: of(image, against) for name, of in further.items()}}
+        return _InView(row, measured, fidelity)
+
+    @cached_property
+    def _labels(self) -> RenderedLabels:
+        return RenderedLabels(self.last, self.backend, self.antialiased)
+
+    @cached_property
+    def _inner(self) -> dict[int, np.ndarray]:
+        return {row: erode(self.masks[self.scene.views[row]]) for row in self.rows}
+
+    def _render(self, g: Gaussians, camera: Camera) -> np.ndarray:
+        return render_rgb(
+            g, camera, backend=self.backend, antialiased=self.antialiased, workspace=self.workspace
+        )
+
+
+def _against_photo(values: Mapping[str, float], full: Mapping[str, float]) -> dict[str, float]:
+    """Columns of what is compared with the photo, of a composition and of the full model."""
+    names = ("ssim", "psnr")
+    columns = {name: values[name] for name in (*names, "num_pixels")}
+    return columns | {f"full_{name}": full[name] for name in names}
 
 
 def _of_whole(values: Mapping[str, float], full: Mapping[str, float]) -> dict[str, float]:
