@@ -1,12 +1,15 @@
-"""Memory that runs out is one line, whoever says so."""
+"""Memory that runs out is one line, whoever says so; what is freed goes back."""
 
 import errno
+import platform
+import resource
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sagesplat.core.errors import LabelError, OutOfMemory
-from sagesplat.core.memory import named_memory, ran_out
+from sagesplat.core.memory import named_memory, ran_out, return_freed
 
 
 def caused(cause: BaseException) -> Exception:
@@ -50,3 +53,17 @@ def test_other_errors_stay_what_they_are(error: Exception, tmp_path: Path) -> No
     assert not ran_out(error)
     with pytest.raises(type(error)), named_memory("run"):
         raise error
+
+
+@pytest.mark.skipif("glibc" not in platform.libc_ver(), reason="other libraries keep less of what is freed")
+def test_freed_memory_goes_back_to_the_system():
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    blocks = [np.ones(8000) for _ in range(2000)]  # 128 MB, each too small to be mapped by itself
+    last = blocks[-1]  # keeps the others from the end of the heap, which is given back by itself
+    del blocks
+    before = resident()
+    return_freed()
+    assert before - resident() > 50e6
+    assert last[0] == 1
