@@ -6,10 +6,12 @@ import sys
 import tarfile
 import tomllib
 import zipfile
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
@@ -34,6 +36,21 @@ def test_the_constraints_satisfy_what_is_required(requirement: Requirement) -> N
     pinned = constraints()
     assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)])
     assert any(one.operator in (">=", "==") for one in requirement.specifier), "needs a minimum"
+
+
+def test_the_pinned_versions_run_on_the_lowest_python() -> None:
+    """Pins are chosen on one Python: one that needs a later 3.11 breaks set-up on Debian 12's 3.11.2."""
+    lowest = PROJECT["requires-python"].removeprefix(">=") + ".0"
+    pinned = constraints()
+    needs = {
+        name: one.metadata["Requires-Python"]
+        for one in distributions()
+        if (name := canonicalize_name(one.metadata["Name"])) in pinned
+        and pinned[name] == Version(one.version)
+        and one.metadata["Requires-Python"]
+    }
+    assert needs
+    assert {name: text for name, text in needs.items() if not SpecifierSet(text).contains(lowest)} == {}
 
 
 def test_sdist_and_wheel_hold_everything(tmp_path: Path) -> None:
