@@ -177,7 +177,7 @@ def measure(case: Case, folder: Path, views: int, steps: int, say: Say) -> dict[
         for metric in ("psnr", "ssim"):
             ahead = [scored[fit][s][metric] - scored["rival"][s][metric] for s in shares]
             result[fit][f"{metric}_ahead"] = {"mean": float(np.mean(ahead)), "least": float(min(ahead))}
-    result["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    result["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     return result
 
 

@@ -44,7 +44,9 @@ def main(
     seconds = time.perf_counter() - begin
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     found = {"count": count, "fit": fit, "seconds": seconds, "cpu": used.ru_utime + used.ru_stime}
-    finish("cloud", found | {"peak_gb": used.ru_maxrss / 2**20, "stages": stage_seconds(RunDir(run))}, write)
+    finish(
+        "cloud", found | {"peak_gb": used.ru_maxrss * 1024 / 1e9, "stages": stage_seconds(RunDir(run))}, write
+    )
 
 
 def cloud(splats: list[Gaussians], count: int, seed: int) -> Gaussians:

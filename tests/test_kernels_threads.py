@@ -1,5 +1,8 @@
 """Items side by side: order, failures, threads, and the same bits as one after the other."""
 
+import os
+import subprocess
+import sys
 import threading
 
 import numba
@@ -62,6 +65,17 @@ def test_a_thread_pool_that_cannot_be_shared_is_not(two_threads, monkeypatch):
     monkeypatch.setattr(threads.parallel, "threading_layer", lambda: "workqueue")
     _, *others = side_by_side(lambda _: threading.get_ident(), range(8))
     assert set(others) == {threading.get_ident()}
+
+
+def test_no_item_takes_more_threads_than_its_caller_may():
+    script = (
+        "import numba, torch; from sagesplat.kernels.threads import side_by_side\n"
+        "numba.set_num_threads(2); torch.set_num_threads(2)\n"
+        "print(max(side_by_side(lambda _: numba.get_num_threads(), range(4))))"
+    )
+    settings = {**os.environ, "NUMBA_NUM_THREADS": "4"}
+    done = subprocess.run([sys.executable, "-c", script], env=settings, capture_output=True, text=True)
+    assert done.stdout == "2\n", done.stderr
 
 
 def test_each_thread_has_its_own_workspace():

@@ -381,3 +381,8 @@ def test_a_run_as_one_page(run: Path, tmp_path: Path) -> None:
     assert out.read_text().count('data-uri="chunks/') == len({one.uri for one in listed})
     with pytest.raises(RunError, match=r"name that ends in \.html"):
         bundle(job, tmp_path / "folder", single_file=True)
+
+
+def test_a_folder_that_is_no_run_has_no_bundle(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"not a run folder \(no scene\.json\); begin with `sagesplat run"):
+        bundle(job_of(tmp_path), tmp_path / "out")

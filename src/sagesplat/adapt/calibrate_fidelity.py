@@ -35,7 +35,7 @@ _NOISE_SIGMAS = 3.0  # standard deviations of a share of views that are no more 
 # Of the least support of the viewpoints drawn, below which nothing is promised. One more from the same
 # distribution is often a little sparser where they lie far apart: on the built-in capture 8 % of decisions of
 # those walking and 14 % of those stepping back had no promise with 1, 2 % and 6 % have none with this.
-SPARSER = 0.7
+LEAST_SUPPORT_SHARE = 0.7
 _NEAR = 0.15  # `Expected.away` of viewpoints that count as on the capture's path
 # Of the share of decisions that may miss on the capture's path: on some screens and through some lenses more
 # do than of all viewpoints, and each kind is to keep its share (docs/developers/promises.md).
@@ -182,7 +182,9 @@ class Trial:
 
     def least_support(self, label: int) -> float:
         """The support from which on something is promised, after these viewpoints."""
-        return SPARSER * float(self.support[self.views(label), list(self.labels).index(label)].min())
+        return LEAST_SUPPORT_SHARE * float(
+            self.support[self.views(label), list(self.labels).index(label)].min()
+        )
 
 
 def remove_composition_bias(
@@ -294,7 +296,7 @@ def calibrated(
         others = [one.of(kind).for_model(models[label]) for other, one in decisions.items() if other != label]
         # off the path, and from too few viewpoints, as strict as promised
         shares = (confidence,) if kind is False else (stricter, confidence)
-        return own.joined(others), partial(_strictest, own=len(own.away), shares=shares)
+        return own.joined(others), partial(_conformal, own=len(own.away), shares=shares)
 
     enough = [label for label, one in decisions.items() if len(one.away) >= fewest]
     asked = {}
@@ -321,7 +323,7 @@ def calibrated(
     return found
 
 
-def _strictest(
+def _conformal(
     of_views: Float[np.ndarray, "G n"], own: int, shares: Sequence[float]
 ) -> Float[np.ndarray, " G"]:
     """The conformal quantile at the first share for which there are enough viewpoints; `own` come first."""

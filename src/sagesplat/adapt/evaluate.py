@@ -226,7 +226,8 @@ class _TestViews:
         view, photo = self.scene.views[row], as_unit(self.photos[row])
         neutral = view.camera.neutral  # fidelity is promised of pictures without a photo's exposure
         reference = self.kept[row] if row in self.kept else self._render(self.origin, neutral)
-        if row not in self.kept and (len(self.kept) + 1) * reference.nbytes <= KEPT:
+        kept = sum(image.nbytes for image in list(self.kept.values()))  # other threads add some meanwhile
+        if row not in self.kept and kept + reference.nbytes <= KEPT:
             self.kept[row] = reference
         image = reference if g is self.origin else self._render(g, neutral)
         least = PROMISED_SHARE * image.shape[0] * image.shape[1]

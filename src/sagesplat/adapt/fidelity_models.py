@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sagesplat.adapt.calibrate import AT_A_PHOTO, conformal_quantile, critical_margins
-from sagesplat.adapt.calibrate_fidelity import SPARSER, TARGETS, calibration_of
+from sagesplat.adapt.calibrate_fidelity import LEAST_SUPPORT_SHARE, TARGETS, calibration_of
 from sagesplat.adapt.cell_models import (
     FACTOR_STEP,
     LOG_STEP,
@@ -166,7 +166,7 @@ def _fit(
         rmse=float(np.sqrt(((without - category) ** 2).mean(0)).mean()),
         calibration=calibration_of(
             TARGETS + AT_A_PHOTO * margins, margins, "uncalibrated", confidence, 0,
-            SPARSER * float(near[rows].max(1).min()), last,
+            LEAST_SUPPORT_SHARE * float(near[rows].max(1).min()), last,
         ),
     )  # fmt: skip
 

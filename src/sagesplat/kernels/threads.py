@@ -8,6 +8,7 @@ runs on one core. Kernels release the GIL (see `jit`) and a `Workspace` is anoth
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import TypeVar
 
 import numba
@@ -31,18 +32,20 @@ def side_by_side(function: Callable[[Item], Result], items: Sequence[Item]) -> I
     if threads == 1:
         yield from map(function, items)
         return
-    each, of_torch = numba.get_num_threads() // threads, torch.get_num_threads()
+    every, of_torch = numba.get_num_threads(), torch.get_num_threads()
 
-    def one_of_several(item: Item) -> Result:
-        numba.set_num_threads(each)
-        torch.set_num_threads(each)
+    def limited(most: int, item: Item) -> Result:
+        """A thread begins with all threads of the machine, whatever the one that starts it may take."""
+        numba.set_num_threads(most)
+        torch.set_num_threads(most)
         return function(item)
 
     pool = ThreadPoolExecutor(threads)
     try:
         # by itself: kernels are compiled, and numba starts its threads; its `Workspace` serves later items
-        yield pool.submit(function, items[0]).result()
-        yield from pool.map(one_of_several, items[1:]) if _concurrent() else map(function, items[1:])
+        yield pool.submit(limited, every, items[0]).result()
+        several = partial(limited, every // threads)
+        yield from pool.map(several, items[1:]) if _concurrent() else map(function, items[1:])
     finally:
         pool.shutdown(cancel_futures=True)
         torch.set_num_threads(of_torch)  # what later threads begin with

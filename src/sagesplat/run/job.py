@@ -41,7 +41,12 @@ from sagesplat.train.sky import Sky, read_sky
 
 _PIECES = 2  # of work for each task that can run: the slower ones then have less to wait for
 _LOCK_WAIT = 60.0  # seconds that a task waits for one which a killed run left behind
-NO_RUN = "not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`"
+
+
+def check_run(run: RunDir) -> None:
+    """RunError for a folder that is no run's."""
+    if not run.scene.exists():
+        raise RunError(f"{run.path}: not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`")
 
 
 @dataclass(eq=False)
@@ -119,8 +124,7 @@ class Job:
         """The capture and its photos, opened together: photos that change from then on are noticed."""
         if self.source is not None:
             return self.source._opened
-        if not self.run.scene.exists():
-            raise RunError(f"{self.run.path}: {NO_RUN}")
+        check_run(self.run)
         made = read_capture(self.run.scene)
         scene = made.load()
         if fingerprint(scene) != made.fingerprint:

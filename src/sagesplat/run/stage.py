@@ -13,7 +13,7 @@ from sagesplat.core.events import StageDone, StageSkipped, StageStarted
 from sagesplat.core.memory import named_memory, return_freed
 from sagesplat.io.files import named_full_disk, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
-from sagesplat.run.job import NO_RUN, Job
+from sagesplat.run.job import Job, check_run
 from sagesplat.run.records import is_done, read_record, record
 from sagesplat.run.stage_table import command_of, needed_for, stage_kind
 
@@ -91,8 +91,8 @@ def run_stages(
 
 def _is_done(job: Job, stage: Stage) -> bool:
     """Whether a stage is to be skipped, which is said; RunError where it cannot be done."""
-    if "scene" in needed_for(stage.name) and not job.run.scene.exists():
-        raise RunError(f"{job.run.path}: {NO_RUN}")
+    if "scene" in needed_for(stage.name):
+        check_run(job.run)
     for path in stage.inputs:
         if not path.exists():
             after = command_of(stage.name)

@@ -21,7 +21,7 @@ from sagesplat.core.events import Emit, Event
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.text_table import aligned
 from sagesplat.raster import Backend, prepared, resolve_backend, set_threads
-from sagesplat.run.job import NO_RUN, Job
+from sagesplat.run.job import Job, check_run
 from sagesplat.run.run_dir import RunDir, check_links
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.display_names import titles
@@ -182,8 +182,7 @@ def open_run(folder: Path | str, ladder: LadderKind = "nested") -> "FinishedRun"
     """
     run = RunDir(Path(folder), ladder)
     check_links(run.path)
-    if not run.scene.exists():
-        raise RunError(f"{run.path}: {NO_RUN}")
+    check_run(run)
     return FinishedRun(Job(run, ignore))
 
 

@@ -20,7 +20,7 @@ from sagesplat.core.names import composed
 from sagesplat.formats.increments import INDEX, Increment, full_scene, read_increments
 from sagesplat.formats.label_edits import ladder_hash
 from sagesplat.raster import rasterize
-from sagesplat.run.job import Job
+from sagesplat.run.job import Job, check_run
 from sagesplat.run.records import is_made_from
 from sagesplat.scene import read_scene
 from sagesplat.segment.display_names import meant
@@ -185,6 +185,7 @@ def _jpeg(pixels: UInt8[np.ndarray, "H W 3"], quality: int) -> bytes:
 
 def _check_made(job: Job) -> None:
     run = job.run
+    check_run(run)
     against_photos = (("observe", run.observations), ("fit", run.promises)) if has_photos(run) else ()
     for stage, path in (
         ("nest", run.increments / INDEX),

@@ -22,7 +22,7 @@ from sagesplat.core.events import StageDone, StageStarted
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.label_edits import FILE, LabelEdits, dump_edits, ladder_hash, read_edits
 from sagesplat.io.files import atomic_folder, loads_json
-from sagesplat.run.job import NO_RUN, Job
+from sagesplat.run.job import Job, check_run
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.records import read_record, record
 from sagesplat.run.run_dir import RunDir
@@ -75,8 +75,7 @@ def apply_labels(
     path = edits or job.run.path / FILE
     out = (out or job.run.path.resolve().with_name(f"{job.run.path.resolve().name}-edited")).resolve()
     job = replace(job, run=replace(job.run, ladder="nested"), locks=None)
-    if not job.run.scene.exists():
-        raise RunError(f"{job.run.path}: {NO_RUN}")
+    check_run(job.run)
     if not is_finished(job.run):
         raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, then apply the edits")
     found = read_edits(path)
