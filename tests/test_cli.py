@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 from conftest import Call, random_gaussians, write_capture
+from PIL import Image
 
 from sagesplat import cli
 from sagesplat.cli import help
 from sagesplat.cli.overview import GROUPS, summaries
 from sagesplat.core.names import visible
+from sagesplat.formats.splats import write_splat
 
 
 @pytest.mark.parametrize(("given", "found"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
@@ -181,7 +183,10 @@ def test_every_argument_of_every_command_has_help() -> None:
     ("words", "says"),
     [
         (["run", "a"], "Missing from sagesplat run: RUN"),
-        (["run", "a", "b", "--train.max-steps", "x"], "Error parsing --train.max-steps"),
+        (
+            ["run", "a", "b", "--train.max-steps", "x"],
+            "Error parsing --train.max-steps: not a whole number: 'x'",
+        ),
         (
             ["run", "a", "b", "--trian.max-steps", "3"],
             "no option --trian.max-steps; did you mean --train.max",
@@ -199,6 +204,45 @@ def test_words_that_cannot_be_parsed_are_one_line(words: list[str], says: str, c
     assert error.startswith(f"sagesplat: {says}")
     assert error.endswith(f"see `sagesplat {words[0]} --help`\n")
     assert error.count("\n") == 1
+
+
+SPLAT, CAPTURE, RUN = "splat.spz", "capture", "made"
+NO_BUNDLE, NO_RUN = "neither a bundle (no manifest.json) nor a run folder", "(no scene.json)"
+BEGIN, ADOPT = "begin with `sagesplat run SCENE RUN`", f"`sagesplat adopt {SPLAT} RUN` makes one of a splat"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["run", RUN, "new"], f"{RUN}: a run folder; give the capture it was made of, or"),
+        (["info", SPLAT], f"{SPLAT}: no capture; if it is a splat, `sagesplat adopt {SPLAT} RUN`"),
+        (["adopt", SPLAT, SPLAT], f"{SPLAT}: a file; name a new folder for the run"),
+        (["adopt", RUN, "new"], f"{RUN}: a run folder; `sagesplat export {RUN} scene.ply` writes its splat"),
+        (["measure", CAPTURE], f"{CAPTURE}: neither a run, a bundle nor a splat; give one of these"),
+        (["view", CAPTURE], f"{CAPTURE}: {NO_BUNDLE} {NO_RUN}; {BEGIN}"),
+        (["view", SPLAT], f"{SPLAT}: no such folder; {ADOPT}"),
+        (["bundle", CAPTURE, "new"], f"{CAPTURE}: not a run folder {NO_RUN}; {BEGIN}"),
+        (["export", SPLAT, SPLAT], f"{SPLAT}: not a run folder {NO_RUN}; {ADOPT}"),
+        (["transfer", RUN, CAPTURE], f"{CAPTURE}: not a run folder {NO_RUN}; {BEGIN}"),
+        (["compare", CAPTURE], f"{CAPTURE}: not a run folder {NO_RUN}; {BEGIN}"),
+    ],
+)  # fmt: skip
+def test_a_path_of_another_kind_is_told_by_its_kind_and_nothing_is_written(
+    words: list[str], says: str, command: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_capture(tmp_path / CAPTURE, random_gaussians(12))
+    write_splat(tmp_path / SPLAT, random_gaussians(12))
+    (tmp_path / RUN / "provenance").mkdir(parents=True)
+    (tmp_path / RUN / "scene.json").write_text("{}")
+    (tmp_path / RUN / "masks").mkdir()
+    Image.new("RGB", (8, 8)).save(tmp_path / RUN / "masks/a.png")
+    before = sorted(tmp_path.rglob("*"))
+    code, error = command(*words)
+    assert code == 2
+    assert error.startswith(f"sagesplat: {says}")
+    assert error.count("\n") == 1
+    assert [path for path in sorted(tmp_path.rglob("*")) if path.name != ".lock"] == before
 
 
 @pytest.mark.parametrize("name", ["[/red]", "\x1b[31mred", "caf\udce9", "a\u202eb"])

@@ -47,6 +47,10 @@ def events_of(text: str) -> dict[str, Event]:
     }
 
 
+def test_a_warning_of_several_stages_is_shown_once() -> None:
+    assert printed(Warned("no weights"), Noted("a"), Warned("no weights"), Warned("other")).count("!") == 2
+
+
 @settings(max_examples=60)
 @given(ANY)
 def test_whatever_events_hold_is_shown(text: str) -> None:

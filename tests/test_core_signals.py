@@ -131,12 +131,20 @@ def test_a_program_that_hangs_at_its_end_can_still_be_ended(tmp_path: Path) -> N
         "class Slow:\n    def __del__(self):\n        ready()\n        rest()\nSlow()\nrest()",
         # Python ends itself by SIGINT where a plain KeyboardInterrupt passed through an `exec`
         "exec('ready(); rest()', globals())",
+        # C code that goes on though an exception is set, as numba's dispatcher did
+        "try:\n    ready()\n    rest()\nexcept KeyboardInterrupt as stop:\n    raise SystemError from stop",
     ],
 )
 def test_no_signal_goes_astray(tmp_path: Path, code: str) -> None:
     process = started(code, tmp_path)
     process.send_signal(signal.SIGINT)
     assert ended(process) == (2, "", LINES[signal.SIGINT])
+
+
+def test_an_error_of_c_code_without_a_signal_is_not_hidden(tmp_path: Path) -> None:
+    code, _, says = ended(started("ready(); raise SystemError('f: bad argument')", tmp_path))
+    assert code == 1
+    assert says.endswith("SystemError: f: bad argument\n")
 
 
 STARTS = """

@@ -63,6 +63,11 @@ def test_an_error_of_writing_names_its_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="File too large") as caught, atomic_path(path):
         raise OSError(errno.EFBIG, "File too large")
     assert caught.value.filename == str(path)
+    (tmp_path / "file").touch()
+    for impossible in (tmp_path / "file/a.txt", Path("/proc/a.txt")):
+        with pytest.raises(OSError) as caught, atomic_path(impossible):  # noqa: PT011 (of each system's own)
+            pass
+        assert "tmp-" not in str(caught.value.filename)
 
 
 @pytest.mark.parametrize(

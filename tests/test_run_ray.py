@@ -200,12 +200,15 @@ def test_a_node_without_the_folder_or_with_another_version_is_one_line(tmp_path:
         ("rey", "--executor rey: not known; use local, ray or ray:HOST:PORT"),
         ("ray:127.0.0.1:1", r"--executor ray:127\.0\.0\.1:1: no answer .*`ray start --head`"),
         ("ray:6379", "no answer"),
+        ("ray", r"--executor ray: no answer from 127\.0\.0\.1:1, the head of .*`ray stop` here forgets it"),
     ],
 )
 def test_an_executor_that_is_not_there_is_one_line(
     executor: str, says: str, tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray_cluster, "_started_here", lambda: "127.0.0.1:1")  # its head is gone
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     with pytest.raises(RunError, match=says), computing(Machine(executor=executor), tmp_path):
         pass
 

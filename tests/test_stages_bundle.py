@@ -167,7 +167,7 @@ def test_a_finished_run_is_shown_without_its_capture(run: Path, tmp_path: Path, 
 def test_an_unfinished_run_names_the_command(run, tmp_path, viewer, missing, command) -> None:
     path = run / missing
     shutil.rmtree(path) if path.is_dir() else path.unlink()
-    with pytest.raises(RunError, match=rf"finished nested ladder: run `sagesplat {command}`"):
+    with pytest.raises(RunError, match=rf"finished nested levels: run `sagesplat {command} {run}`, or"):
         bundle(job_of(run), tmp_path / "out", viewer=viewer)
     assert not (tmp_path / "out").exists()
 

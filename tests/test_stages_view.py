@@ -54,7 +54,7 @@ def scene(number: int) -> dict[str, bytes]:
         ({}, r"neither a bundle \(no manifest.json\) nor a run folder"),
         ({"manifest.json": b'{"format": "other"}'}, r"manifest.json: not of a sagesplat bundle"),
         (scene(1), r"a run folder of format 1, this sagesplat \(.*\) reads \d; run again into a new"),
-        (scene(FORMAT), r"not finished; run `sagesplat run` again, or add --follow"),
+        (scene(FORMAT), r"no finished nested levels; run `sagesplat run` again with --ladder nested, or add"),
     ],
 )
 def test_other_folders(bundle: Path, tmp_path: Path, contents: dict[str, bytes], message: str):

@@ -18,7 +18,7 @@ def program() -> None:
             from sagesplat.cli import main
 
             main()
-        except KeyboardInterrupt as error:
+        except (KeyboardInterrupt, SystemError) as error:
             signals.leave(error)
 
 

@@ -58,7 +58,7 @@ def _command(name: str, *words: str) -> None:
             function(**arguments(name, function, list(words)))
     except SageError as error:
         _fail(str(error))
-    except KeyboardInterrupt as error:
+    except (KeyboardInterrupt, SystemError) as error:
         signals.leave(error)
     except BrokenPipeError:
         raise

@@ -88,13 +88,23 @@ Flat = arg(name="")
 
 
 @contextmanager
-def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -> Iterator["Job"]:
-    """A job on a run folder, shown on the console; options that a command does not have are the defaults."""
+def open_job(
+    run: Path, options: Redo | Device, ladder: LadderKind = "nested", *, begins: bool = False
+) -> Iterator["Job"]:
+    """A job on a run folder, shown on the console; options that a command does not have are the defaults.
+
+    RunError, before anything is done, where there is no run; with `begins`, where none can begin.
+    """
     from sagesplat.cli.console import Console
     from sagesplat.run.job import Job
-    from sagesplat.run.run_dir import RunDir, check_links
+    from sagesplat.run.run_dir import RunDir, check_links, check_run
 
     check_links(run)
+    folder = RunDir(run, ladder)
+    if not begins:
+        check_run(folder)
+    elif run.is_file():
+        raise RunError(f"{run}: a file; name a new folder for the run")
     machine = Machine(**vars(options))
     limit = int(machine.memory_limit * 2**30)
     with computing(machine, run) as (backend, threads, executor), Console() as console, ExitStack() as locks:
@@ -103,7 +113,6 @@ def open_job(run: Path, options: Redo | Device, ladder: LadderKind = "nested") -
         if machine.executor != "local":
             tasks = "1 task" if executor.parallel == 1 else f"{executor.parallel} tasks"
             console.note(f"on a Ray cluster, {tasks} at once")
-        folder = RunDir(run, ladder)
         yield Job(
             folder, console, backend, threads, machine.force, machine.processes, machine.device,
             limit, locks, executor, before_redo=_approval(folder, console, machine.yes),

@@ -80,6 +80,7 @@ class Console:
         self._shown = 0.0
         self._mark = 0
         self._remaining = Remaining()
+        self._warned = set[str]()
 
     def __enter__(self) -> "Console":
         self._bar.start()
@@ -107,7 +108,9 @@ class Console:
                 text = f"step {step} loss {loss:.3f} · {num / 1000:.1f}k Gaussians {by_label}"
                 self._advance("train", step, total, text)
             case Warned(text):
-                self.say(f"! {text}", style="yellow")
+                if text not in self._warned:  # stages may find the same
+                    self._warned.add(text)
+                    self.say(f"! {text}", style="yellow")
             case Noted(text):
                 self.note(text)
             case StageDone(name, seconds, lines):

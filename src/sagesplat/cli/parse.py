@@ -19,6 +19,10 @@ from sagesplat.core.config import PlanConfig
 from sagesplat.core.errors import SageError
 from sagesplat.io.typed import impossible, refusal
 
+_PYTHON = {  # what Python says of a text that is no number, and what it is not
+    "invalid literal for int() with base 10:": "a whole number",
+    "could not convert string to float:": "a number",
+}
 _DIRECTIONS = {"-x", "-y", "-z"}
 _TARGETS = {"--target-fidelity", "--target-ssim"}  # of a plan: one given, the recorded ones are gone
 _AS_THEY_ARE = "--downscale", 1  # what most runs record; what they were given is 0, for the run to choose
@@ -96,7 +100,7 @@ def _unknown(function: Callable[..., None], words: Sequence[str]) -> str:
     word = next((word for word in words if word.startswith("-")), words[0])
     flag = word.partition("=")[0]
     if not flag.startswith("-"):
-        return f"{word!r} is one argument too many"
+        return f"{word!r} is one argument too many; names with spaces need quotes"
     known = {f.name.strip("-"): f.name for f in flags_of(function) if f.name.startswith("--")}
     for names in (known, {name.rpartition(".")[2]: whole for name, whole in known.items()}):
         if near := get_close_matches(flag.strip("-"), names, n=1):
@@ -114,7 +118,10 @@ def _flat(message: str) -> str:
         elif text:
             parts[-1].append(text)
     body = parts[0][1:] or [line for part in parts[1:2] for line in part]
-    return " ".join(body).rstrip(".:")
+    text = " ".join(body).rstrip(".:")
+    for words, kind in _PYTHON.items():
+        text = text.replace(words, f"not {kind}:")
+    return text
 
 
 def _with_defaults(function: Callable[..., None], values: Mapping[str, Any]) -> Callable[..., None]:

@@ -97,7 +97,7 @@ def run(
     config = RunConfig(
         scene_config, poses, masks, labels, train, clean, blocks, nest, sample, fit, plan, fuse, ladder, seed
     )
-    with open_job(run, machine, ladder) as job:
+    with open_job(run, machine, ladder, begins=True) as job:
         pipeline.run_all(job, scene, config)
 
 
@@ -121,7 +121,7 @@ def adopt(
     from sagesplat.stages import pipeline
 
     config = RunConfig(scene_config, masks=masks, labels=labels, sample=sample, fit=fit, plan=plan)
-    with open_job(run, machine) as job:
+    with open_job(run, machine, begins=True) as job:
         pipeline.adopt(job, splat, adopt, config)
 
 
@@ -142,7 +142,7 @@ def demo(
     """
     from sagesplat.stages import pipeline
 
-    with open_job(run, machine) as job:
+    with open_job(run, machine, begins=True) as job:
         pipeline.run_demo(job, places, wild)
 
 
@@ -160,7 +160,7 @@ def masks(
     from sagesplat.stages.label import make_masks
     from sagesplat.stages.scene import check_not_adopted, open_scene
 
-    with open_job(run, machine) as job:
+    with open_job(run, machine, begins=True) as job:
         check_not_adopted(job.run)
         open_scene(job, scene, scene_config, poses, masks, labels)
         make_masks(job, masks, labels)
@@ -367,11 +367,11 @@ def report(
 
     with open_job(run, machine, "snapshots" if paper else ladder) as job:
         if paper:
-            from sagesplat.studies.lpips import warn_of_lpips
+            from sagesplat.studies.lpips import load_metrics
             from sagesplat.studies.paper.run import paper_report
             from sagesplat.studies.paper.snapshots import adapt_snapshots
 
-            warn_of_lpips(job, settings.lpips)
+            load_metrics(job.emit, settings.lpips)  # what is missing is said before the work
             adapt_snapshots(job)
             paper_report(job, settings)
         else:

@@ -115,11 +115,11 @@ def compare(
     """
     from sagesplat.stages.scene import check_not_adopted
     from sagesplat.studies.compare.run import compare as compare_methods
-    from sagesplat.studies.lpips import warn_of_lpips
+    from sagesplat.studies.lpips import load_metrics
 
     with open_job(run, machine) as job:
         check_not_adopted(job.run)
-        warn_of_lpips(job, compare.lpips)
+        load_metrics(job.emit, compare.lpips)  # what is missing is said before the work
         compare_methods(job, compare, json)
 
 

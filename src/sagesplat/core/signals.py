@@ -181,9 +181,17 @@ def answered_at_once() -> Iterator[None]:
         _stop.watched = False
 
 
-def leave(error: KeyboardInterrupt) -> NoReturn:
-    """End the program with the line and the exit code of a signal."""
-    number = error.number if isinstance(error, Stopped) else signal.SIGINT
+def leave(error: KeyboardInterrupt | SystemError) -> NoReturn:
+    """End the program with the line and the exit code of a signal; other errors are raised again.
+
+    C code, such as numba's dispatcher, wraps what the handler raised within it in a SystemError.
+    """
+    stop: BaseException | None = error
+    while not isinstance(stop, KeyboardInterrupt):
+        if stop is None:
+            raise error
+        stop = stop.__cause__ or stop.__context__
+    number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
     _say(number)
     raise Left(_exit_code(number))
 

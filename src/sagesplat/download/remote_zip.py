@@ -24,6 +24,7 @@ TAIL = 1 << 20  # bytes at the end of an archive that usually contain its direct
 MAX_DIRECTORY = 1 << 24  # bytes
 HEADER = 30  # bytes of a member's local header, before name and extra field
 AGAIN = "run it again: finished files are kept"
+ELSEWHERE = f"{AGAIN}; or run it on another machine, and copy the folder"
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ class RemoteZip:
                     error.close()
                 if pause is None or not _is_temporary(error):
                     reason = short(error) or type(error).__name__
-                    raise DataError(f"{self.url}: cannot be downloaded ({reason}); {AGAIN}") from None
+                    raise DataError(f"{self.url}: cannot be downloaded ({reason}); {ELSEWHERE}") from None
                 self._sleep(pause)
 
     def _check_range(self, text: str, start: int, stop: int) -> None:

@@ -92,7 +92,8 @@ def _fetch_weights(
     layers = [(k, n, part) for k, n in enumerate(source.convolutions) for part in ("weight", "bias")]
     backbone = {f"conv{k}.{part}": f"features.{n}.{part}" for k, n, part in layers}
     heads = {f"lin{k}": f"lin{k}.model.1.weight" for k in range(5)}  # [1, C, 1, 1]
-    cure = f"try again, or copy {path.name} from another machine to {path.parent}, or give --lpips FOLDER"
+    both = " and ".join(weights_path(each, path.parent).name for each in SOURCES)
+    cure = f"try again, or copy {both} from another machine to {path.parent}, or give --lpips FOLDER"
     expected, weights = shapes(net), {}
     files = (
         (source.heads, source.heads_sha256, heads, MAX_HEADS),

@@ -23,6 +23,8 @@ CURES = {
     errno.EPERM: "check its rights, or choose another place",
     errno.EFBIG: "raise the limit of files (ulimit -f), or choose another disk",
     errno.ENAMETOOLONG: "choose a shorter path",
+    errno.EEXIST: "a folder is needed there; choose another place",
+    errno.ENOTDIR: "a folder is needed there; choose another place",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
 }
 _TEMPORARY = "tmp-"  # in the names of incomplete files and folders
@@ -47,9 +49,13 @@ def atomic_path(path: Path, *, nbytes: int = 0, sync: bool = True) -> Iterator[P
     """
     with named_full_disk(path, nbytes):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(
-            dir=path.parent, prefix=f".{path.stem[:_STEM]}.{_TEMPORARY}", suffix=path.suffix
-        )
+        try:
+            handle, name = tempfile.mkstemp(
+                dir=path.parent, prefix=f".{path.stem[:_STEM]}.{_TEMPORARY}", suffix=path.suffix
+            )
+        except OSError as error:
+            error.filename = str(path)  # the temporary file's name says nothing
+            raise
         os.close(handle)
         temporary = Path(name)
         try:

@@ -28,7 +28,7 @@ from sagesplat.raster import Backend
 from sagesplat.run.capture import check_photos, fingerprint, photo_hashes, read_capture
 from sagesplat.run.executor import LOCAL, Executor, Local
 from sagesplat.run.records import settings_of
-from sagesplat.run.run_dir import RunDir
+from sagesplat.run.run_dir import RunDir, check_run
 from sagesplat.scene.images import Photos
 from sagesplat.scene.refined import read_refined, with_cameras
 from sagesplat.scene.scene import Scene
@@ -41,12 +41,6 @@ from sagesplat.train.sky import Sky, read_sky
 
 _PIECES = 2  # of work for each task that can run: the slower ones then have less to wait for
 _LOCK_WAIT = 60.0  # seconds that a task waits for one which a killed run left behind
-
-
-def check_run(run: RunDir) -> None:
-    """RunError for a folder that is no run's."""
-    if not run.scene.exists():
-        raise RunError(f"{run.path}: not a run folder (no scene.json); begin with `sagesplat run SCENE RUN`")
 
 
 @dataclass(eq=False)

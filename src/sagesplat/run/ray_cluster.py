@@ -12,7 +12,6 @@ import signal
 import socket
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,10 +35,6 @@ _OPEN = (
     "this Ray cluster does not check tokens: whoever reaches its port can run programs as you; start it "
     "with RAY_AUTH_MODE=token (docs/guides/cluster.md)"
 )
-_WAITS = (
-    "the cluster that this machine belongs to does not answer yet; if its head is gone, stop this and let "
-    "`ray stop` here forget it"
-)
 # Ray's own word on tokens, which depends on its version; we say what matters
 _ABOUT_TOKENS = "authentication_token_setup"
 
@@ -59,7 +54,7 @@ def connected(address: str = "") -> Iterator[Mapping[str, float]]:
         return
     address = address or os.environ.get("RAY_ADDRESS", "")
     with _heard() as warn:
-        if _join(address, warn):
+        if _join(address):
             if _tells_that_it_is_open():
                 warn(_OPEN)
             yield from _resources()
@@ -75,28 +70,19 @@ def _resources() -> Iterator[Mapping[str, float]]:
         ray.shutdown()
 
 
-def _join(address: str, warn: "_Warnings") -> bool:
-    """Connect to a cluster; False where none is named and none runs."""
+def _join(address: str) -> bool:
+    """Connect to a cluster; False where none is named and none was started here."""
     if address == "local":
         return False
     named = address not in ("", "auto")
     if not named and not (address := _started_here()):
         return False
-    waits = threading.Timer(_GREETED, warn, [_WAITS])
-    waits.daemon = True
-    if named:
-        _check_answers(address)
-    else:
-        waits.start()
+    _check_answers(address, named)
     try:
         with signals.answered_at_once():  # Ray waits for minutes, and starts nothing here
             _init(address=address)
     except ConnectionError as error:
-        if named:
-            raise _no_connection(error) from None
-        return False  # it is gone
-    finally:
-        waits.cancel()
+        raise _no_connection(error) from None
     return True
 
 
@@ -215,7 +201,7 @@ def _heard() -> Iterator[_Warnings]:
         logger.handlers[:] = handlers
 
 
-def _check_answers(head: str) -> None:
+def _check_answers(head: str, named: bool) -> None:
     """RunError where no head answers at host:port `head`: Ray itself would wait for a quarter of an hour."""
     host, _, port = head.rpartition(":")
     try:
@@ -233,7 +219,12 @@ def _check_answers(head: str) -> None:
         cause = "not HOST:PORT"
     except OSError as error:
         cause = short(error)
+    if named:
+        raise RunError(
+            f"--executor ray:{head}: no answer ({cause}); name the cluster's head as HOST:PORT, "
+            "such as ray:10.0.0.1:6379, or start one with `ray start --head`"
+        )
     raise RunError(
-        f"--executor ray:{head}: no answer ({cause}); name the cluster's head as HOST:PORT, "
-        "such as ray:10.0.0.1:6379, or start one with `ray start --head`"
+        f"--executor ray: no answer from {head}, the head of the cluster that this machine belongs to "
+        f"({cause}); `ray stop` here forgets it, or start the head again"
     )

@@ -139,3 +139,16 @@ class RunDir:
         """What a stage's result was made from."""
         folder = self.path if stage_kind(stage).of_all_ladders else self.adapted
         return folder / "provenance" / f"{stage}.json"
+
+
+def check_run(run: RunDir) -> None:
+    """RunError for what is no run folder."""
+    if not run.scene.exists():
+        raise RunError(f"{run.path}: not a run folder (no scene.json); {how_to_begin(run.path)}")
+
+
+def how_to_begin(path: Path) -> str:
+    """The command that makes a run, in the place of a path that is none: of a file, which may be a splat."""
+    if path.is_file():
+        return f"`sagesplat adopt {path} RUN` makes one of a splat"
+    return "begin with `sagesplat run SCENE RUN`"

@@ -13,8 +13,9 @@ from sagesplat.core.events import StageDone, StageSkipped, StageStarted
 from sagesplat.core.memory import named_memory, return_freed
 from sagesplat.io.files import named_full_disk, remove_temporary, sync_changed
 from sagesplat.io.lock import locked
-from sagesplat.run.job import Job, check_run
+from sagesplat.run.job import Job
 from sagesplat.run.records import is_done, read_record, record
+from sagesplat.run.run_dir import check_run
 from sagesplat.run.stage_table import command_of, needed_for, stage_kind
 
 _CLOCK_STEP = 2.0  # seconds: some disks keep no finer time

@@ -17,6 +17,9 @@ VIDEOS = frozenset(
     {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp"}
 )
 
+_RUN = "scene.json", "provenance"  # are in every run folder
+SPLATS = frozenset({".ply", ".spz", ".sog", ".ssog", ".splat", ".glb", ".gltf"})
+
 
 @dataclass(frozen=True)
 class CaptureFormat:
@@ -59,6 +62,8 @@ def locate(path: Path) -> tuple[str, Path]:
         return _of_file(path), path
     if not os.path.isdir(path):
         raise SceneError(f"{path}: no such file or folder; give a capture's folder or a video")
+    if all((path / name).exists() for name in _RUN):  # its label images are no photos
+        raise SceneError(f"{path}: a run folder; give the capture it was made of, or `sagesplat view {path}`")
     if kind := _of_folder(path):
         return kind, path
     below = folders_of(path)
@@ -96,6 +101,10 @@ def _of_file(path: Path) -> str:
         return "stored"
     if suffix in VIDEOS:
         return "video"
+    if suffix in SPLATS:
+        raise SceneError(
+            f"{path}: no capture; if it is a splat, `sagesplat adopt {path} RUN` makes a run of it"
+        )
     raise SceneError(
         f"{path}: neither a transforms .json, an .xml of Metashape nor a video; give one of these, or a "
         "folder (unpack archives)"

@@ -78,6 +78,8 @@ def open_splat(
     scene = replace(scene, downscale=scene.downscale or 1)  # nothing is trained on the photos
     check_folder(job.run)
     _check_run(job.run, config)
+    if RunDir(source).scene.exists():
+        raise RunError(f"{source}: a run folder; `sagesplat export {source} scene.ply` writes its splat")
     check_limits(config)
     own = job.run.capture / repaired(source.resolve().stem)
     photos = _make_capture(job, source, own, config, scene, labelled=not segmented)

@@ -21,8 +21,8 @@ from sagesplat.core.events import Emit, Event
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.core.text_table import aligned
 from sagesplat.raster import Backend, prepared, resolve_backend, set_threads
-from sagesplat.run.job import Job, check_run
-from sagesplat.run.run_dir import RunDir, check_links
+from sagesplat.run.job import Job
+from sagesplat.run.run_dir import RunDir, check_links, check_run
 from sagesplat.scene.scene import Camera, Scene
 from sagesplat.segment.display_names import titles
 from sagesplat.stages import label_edits, pipeline

@@ -20,8 +20,9 @@ from sagesplat.core.names import composed
 from sagesplat.formats.increments import INDEX, Increment, full_scene, read_increments
 from sagesplat.formats.label_edits import ladder_hash
 from sagesplat.raster import rasterize
-from sagesplat.run.job import Job, check_run
+from sagesplat.run.job import Job
 from sagesplat.run.records import is_made_from
+from sagesplat.run.run_dir import check_run
 from sagesplat.scene import read_scene
 from sagesplat.segment.display_names import meant
 from sagesplat.stages.bundle_contents import bundle_contents
@@ -195,8 +196,8 @@ def _check_made(job: Job) -> None:
     ):
         if not path.exists():
             raise RunError(
-                f"{run.path}: no {path.relative_to(run.path)}; a bundle needs a finished nested ladder: "
-                f"run `sagesplat {stage}`, or `sagesplat run`"
+                f"{run.path}: no {path.relative_to(run.path)}; a bundle needs finished nested levels: run "
+                f"`sagesplat {stage} {run.path}`, or `sagesplat run` again with --ladder nested"
             )
     if not is_made_from(run, "fit", run.increments / INDEX):
         raise RunError(f"{run.fidelity}: fitted to other increments; run `sagesplat fit` again with --force")

@@ -22,10 +22,10 @@ from sagesplat.core.events import StageDone, StageStarted
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.label_edits import FILE, LabelEdits, dump_edits, ladder_hash, read_edits
 from sagesplat.io.files import atomic_folder, loads_json
-from sagesplat.run.job import Job, check_run
+from sagesplat.run.job import Job
 from sagesplat.run.recorded import recorded_settings
 from sagesplat.run.records import read_record, record
-from sagesplat.run.run_dir import RunDir
+from sagesplat.run.run_dir import RunDir, check_run
 from sagesplat.segment.display_names import categories
 from sagesplat.segment.masks import UNLABELLED
 from sagesplat.segment.parents import write_parents

@@ -14,7 +14,7 @@ from sagesplat.formats.label_edits import FILE
 from sagesplat.io.files import read_json
 from sagesplat.io.typed import known_json
 from sagesplat.run.records import check_format
-from sagesplat.run.run_dir import RunDir, check_links
+from sagesplat.run.run_dir import RunDir, check_links, how_to_begin
 from sagesplat.viewer.built import check_viewer, package_viewer
 from sagesplat.viewer.hosts import Hosts, is_loopback
 from sagesplat.viewer.server import (
@@ -119,7 +119,8 @@ def _fill(site: "Site", path: Path, emit: Emit, follow: bool) -> Callable[[threa
 def is_bundle(path: Path) -> bool:
     """Whether a folder is a bundle that can be shown; RunError for one that cannot, or for no folder."""
     if not path.is_dir():
-        raise RunError(f"{path}: no such folder; name a run folder or a bundle")
+        cure = how_to_begin(path) if path.is_file() else "name a run folder or a bundle"
+        raise RunError(f"{path}: no such folder; {cure}")
     if not (path / MANIFEST).exists():
         return False
     manifest = read_json(path / MANIFEST)
@@ -134,7 +135,10 @@ def run_bundle(job: "Job") -> Path:
 
     folder = job.run.path / "bundle"
     if not is_finished(job.run):
-        raise RunError(f"{job.run.path}: not finished; run `sagesplat run` again, or add --follow")
+        raise RunError(
+            f"{job.run.path}: no finished nested levels; run `sagesplat run` again with --ladder nested, "
+            "or add --follow"
+        )
     if not _is_current(job.run, folder):
         bundle(job, folder)
     return folder
@@ -146,7 +150,8 @@ def _open_run(path: Path, emit: Emit) -> "Job":
 
     run = RunDir(path)
     if not run.scene.exists():
-        raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json)")
+        cure = how_to_begin(path)
+        raise RunError(f"{path}: neither a bundle (no {MANIFEST}) nor a run folder (no scene.json); {cure}")
     check_links(path)
     record = run.provenance("scene")
     made = read_json(record, "run `sagesplat run` with --force") if record.exists() else {}

@@ -9,7 +9,6 @@ from jaxtyping import Float
 from sagesplat.core.errors import SageError
 from sagesplat.core.events import Emit, Warned
 from sagesplat.metrics.lpips import Features, Lpips, Net, load_lpips, weights_path
-from sagesplat.run.job import Job
 from sagesplat.run.records import file_hash
 
 NETS: tuple[Net, ...] = ("alex", "vgg")
@@ -35,15 +34,3 @@ def load_metrics(emit: Emit, folder: Path | None, nets: Sequence[Net] = NETS) ->
 def features_of(metrics: Mapping[str, Lpips], image: Float[np.ndarray, "H W 3"]) -> dict[str, Features]:
     """What each metric compares of an image, by its column."""
     return {column: metric.features(image) for column, metric in metrics.items()}
-
-
-def warn_of_lpips(job: Job, folder: Path | None) -> None:
-    """Say before a study takes its time that its tables will have no LPIPS, where weights are missing."""
-    missing = [net for net, found in lpips_hashes(folder).items() if found is None]
-    if missing:
-        names = ", ".join(missing)
-        job.emit(
-            Warned(
-                f"tables will be without LPIPS ({names}): no weights; run `sagesplat download lpips` first"
-            )
-        )

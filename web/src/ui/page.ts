@@ -78,7 +78,7 @@ function sentence(viewer: Viewer, done: boolean): string {
     return `Loading the full scene, ${Math.floor(compare.progress * 100)} %`;
   if (state.status === "over budget") return "The lowest levels exceed the budget";
   if (state.status === "infeasible") return shortfall(state, viewer.settings);
-  if (done && viewer.manifest.live) return "Training is running";
+  if (done && viewer.manifest.live) return "The run is still at work";
   if (done) return viewer.settings.mode === "target" ? outside(state) : "";
   return state.count ? "Refining…" : "Loading…";
 }

@@ -60,6 +60,8 @@ def levels_of(path: Path) -> list[Level]:
         return _of_bundle(path, name)
     if (path / "provenance").is_dir():
         return _of_run(path, name)
+    if path.is_dir() and not any((path / name).exists() for name in (LOD_META, META)):
+        raise DataError(f"{path}: neither a run, a bundle nor a splat; give one of these")
     count = num_lods(path)
     if count == 1:
         return [Level(name, "files", stored_bytes(path), partial(read_splat, path))]
