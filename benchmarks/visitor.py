@@ -48,6 +48,8 @@ SCREENS = {
 SECONDS = 60
 _STEPS = 2  # poses a second: software draws no more
 _WALKS = 8  # places that a walk goes through
+_TOGETHER = 10  # seconds of the visit that are drawn as one in the bootstrap: they show nearly the same
+_DRAWS = 1000
 # the next pose; then what is drawn and promised once the page has drawn it
 SAMPLE = """async (pose) => {
   const view = window.sagesplat
@@ -202,14 +204,15 @@ def measure(run: Path, screens: Sequence[str], every: int) -> dict[str, Any]:
         thread.start()
         try:
             for name in screens:
-                results[name] = _on_screen(job, name, sampled(view.urls[0], cameras, SCREENS[name], every))
+                found = sampled(view.urls[0], cameras, SCREENS[name], every)
+                results[name] = _on_screen(job, name, found, max(_TOGETHER * _STEPS // every, 1))
         finally:
             view.stop()
             thread.join()
     return results
 
 
-def _on_screen(job: Job, name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _on_screen(job: Job, name: str, found: Sequence[dict[str, Any]], together: int) -> dict[str, Any]:
     """The visit on one screen, and a line about it."""
     rows = checked(job, found)
     told = [row for row in rows if row["promised"] is not None]
@@ -220,14 +223,29 @@ def _on_screen(job: Job, name: str, found: Sequence[dict[str, Any]]) -> dict[str
         "decisions": len(rows),
         "promised": len(told) / max(len(rows), 1),
         "kept": 1 - len(missed) / max(len(told), 1),
+        "interval": _interval(told, missed, len(found), together),
         "frames_with_a_miss": len({row["frame"] for row in missed}),
         "missed": missed,
     }
     print(
         f"{name}: {len(found)} frames at {result['screen']:.2f} times the photos' focal length; "
-        f"promised {len(told)} of {len(rows)}, of these kept {result['kept']:.3f}"
+        f"promised {len(told)} of {len(rows)}, of these kept {result['kept']:.3f} "
+        f"({result['interval'][0]:.3f} to {result['interval'][1]:.3f})"
     )
     return result
+
+
+def _interval(
+    told: Sequence[dict[str, Any]], missed: Sequence[dict[str, Any]], frames: int, together: int
+) -> list[float]:
+    """95 % interval of the share kept, by a circular bootstrap of frames that follow each other."""
+    counts = np.stack(
+        [np.bincount([row["frame"] for row in rows], minlength=frames) for rows in (told, missed)]
+    )
+    starts = np.random.default_rng(0).integers(frames, size=(_DRAWS, -(-frames // together)))
+    drawn = (starts[..., None] + np.arange(together)).reshape(_DRAWS, -1)[:, :frames] % frames
+    promised, broken = counts[:, drawn].sum(-1)
+    return np.quantile(1 - broken / np.maximum(promised, 1), [0.025, 0.975]).tolist()
 
 
 def main(

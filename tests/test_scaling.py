@@ -108,6 +108,8 @@ def test_recorded_visits_are_read(library: Library):
     # 1 Mbit/s and 100 ms: 12,500 bytes were on their way when the visitor left, or stopped the pack
     assert table[1, 1].tolist() == [33_100, 0, 0, 0, 0]
     assert table[1, 2].tolist() == [50_600, 2000, 3000, 52_500, 47_000]
+    assert table[1, 3].tolist() == [50_600, 2000, 3000, 52_500, 58_700]  # 700 of them a range of a file
+    assert not library.kept[3, 6]
     assert library.kept[0, :5].tolist() == [True] * 5
     assert library.kept[2, :5].tolist() == [True, True, True, True, False]
     assert library.hashed[0].tolist() == [False, True, True, False, *[True] * 7]

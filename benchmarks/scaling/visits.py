@@ -120,10 +120,11 @@ def _tables(one: dict[str, Any], longest: int) -> dict[str, np.ndarray]:
     for row, (profile, visit) in enumerate(visits):
         on_the_way = int(profile["mbit"] * 125 * profile["latencyMs"])  # bytes sent before a server hears
         for ms, index, *part in visit["requests"]:
-            came = part[0] if part else sizes[index]  # all of it is left out
+            came = part[0] if part else int(sizes[index])  # all of it is left out
+            asked = part[1] if len(part) == 2 else int(sizes[index])  # a range
             at.append(ms / 1000)
             file.append(index)
-            body.append(min(came + on_the_way, int(sizes[index])))
+            body.append(min(came + on_the_way, asked))
             kept[row, index] |= came == sizes[index]
     return {
         "kinds": kinds,

@@ -1,7 +1,7 @@
 // Visitors of a bundle and what they ask for: node test/visitors.report.mjs BUNDLE OUT.json [--visits N] [--seed S]
 // [--scale K] [--no-pack]. Time is simulated, so results repeat exactly. docs/scaling.md says what they are for.
 
-import { existsSync, readdirSync, readFileSync, writeFileSync } from "node:fs";
+import { existsSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { fileURLToPath } from "node:url";
 import { parseArgs } from "node:util";
@@ -32,21 +32,28 @@ const wire = (uri) => {
   const content = readFileSync(join(bundle, uri));
   return /\.(css|html|js|json)$/.test(uri) ? gzipSync(content, { level: 6 }).length : content.length;
 };
-const page = ["index.html", ...readdirSync(join(bundle, "assets")).map((name) => `assets/${name}`)];
+const html = readFileSync(join(bundle, "index.html"), "utf8");
+// what the page names; the rest comes when it is needed, in these visits never
+const page = ["index.html", ...new Set(html.match(/\bassets\/[\w.-]+/g))];
 if (existsSync(join(bundle, "poster.jpg"))) page.push("poster.jpg");
 const served = page.map((uri) => ({ uri, wire: wire(uri) }));
 if (promises) {
   served.push({ uri: promises, wire: wire(promises), text: readFileSync(join(bundle, promises), "utf8") });
 }
 
-const chunks = manifest.labels.flatMap(({ levels }, label) =>
-  levels.filter(({ bytes }) => bytes).map(({ uri, bytes }) => ({ uri, bytes, kind: "chunk", label })),
-);
+const chunks = new Map(); // a file holds the levels of one cell, or of many
+for (const [label, { cells }] of manifest.labels.entries()) {
+  for (const { uri, bytes, offset = 0 } of cells.flatMap(({ levels }) => levels)) {
+    if (!bytes) continue;
+    const size = Math.max(offset + bytes, chunks.get(uri)?.bytes ?? 0);
+    chunks.set(uri, { uri, bytes: size, kind: "chunk", label });
+  }
+}
 const files = [
   ...served.map(({ uri, wire }) => ({ uri, bytes: wire, kind: uri === promises ? "promises" : "viewer" })),
   { uri: "manifest.json", bytes: wire("manifest.json"), kind: "manifest" },
   ...(manifest.pack ? [{ uri: manifest.pack.uri, bytes: manifest.pack.bytes, kind: "pack" }] : []),
-  ...chunks,
+  ...chunks.values(),
 ];
 const indexOf = new Map(files.map(({ uri }, i) => [uri, i]));
 // text comes unpacked in the simulation: what came of it counts by its share
@@ -58,10 +65,11 @@ const sent = ({ uri, bytes }) => {
   const file = files[indexOf.get(uri)];
   return Math.round((bytes * file.bytes) / (raw.get(uri) ?? file.bytes));
 };
-/** ms, file, and the bytes that came unless it was all of it. */
+/** ms, file, and the bytes that came unless it was all of it; then those of the range that was asked for. */
 const row = (one) => {
   const index = indexOf.get(one.uri);
   const came = sent(one);
+  if (one.asked !== undefined) return [one.ms, index, came, one.asked];
   return came === files[index].bytes ? [one.ms, index] : [one.ms, index, came];
 };
 

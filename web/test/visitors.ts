@@ -126,10 +126,11 @@ function turn(a: Quat, b: Quat, t: number): Quat {
   return [x / size, y / size, z / size, w / size];
 }
 
-/** One request: ms since the visitor came, path, bytes of the body that came. */
+/** One request: ms since the visitor came, path, bytes of the range that was asked for, and of what came. */
 export interface Request {
   readonly ms: number;
   readonly uri: string;
+  readonly asked?: number;
   bytes: number;
 }
 
@@ -137,7 +138,9 @@ export interface Request {
 function recording(network: Network, clock: VirtualClock, log: Request[]): Fetch {
   return async (url, init) => {
     const uri = new URL(url).pathname.slice(1);
-    const entry: Request = { ms: Math.round(clock.now()), uri, bytes: 0 };
+    const range = /^bytes=(\d+)-(\d+)$/.exec(new Headers(init?.headers).get("Range") ?? "");
+    const asked = range ? { asked: Number(range[2]) - Number(range[1]) + 1 } : {};
+    const entry: Request = { ms: Math.round(clock.now()), uri, ...asked, bytes: 0 };
     log.push(entry);
     const reply = await network.fetch(url, init);
     const { body } = reply;
