@@ -120,12 +120,12 @@ def _tables(one: dict[str, Any], longest: int) -> dict[str, np.ndarray]:
     for row, (profile, visit) in enumerate(visits):
         on_the_way = int(profile["mbit"] * 125 * profile["latencyMs"])  # bytes sent before a server hears
         for ms, index, *part in visit["requests"]:
-            came = part[0] if part else int(sizes[index])  # all of it is left out
-            asked = part[1] if len(part) == 2 else int(sizes[index])  # a range
+            size = int(sizes[index])
+            came, asked = (*part, size, size)[:2]  # left out where they are all of the file
             at.append(ms / 1000)
             file.append(index)
             body.append(min(came + on_the_way, asked))
-            kept[row, index] |= came == sizes[index]
+            kept[row, index] |= came == size
     return {
         "kinds": kinds,
         "sizes": sizes,

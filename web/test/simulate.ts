@@ -129,7 +129,7 @@ export class Network {
       this.close();
       return this.reply(200, null, tag);
     }
-    const range = /^bytes=(\d+)-(\d+)$/.exec(new Headers(init?.headers).get("Range") ?? "");
+    const range = rangeOf(init);
     if (range) this.askedRanges.push(`${path} ${range[1]}-${range[2]}`);
     if (!range || !this.ranges) {
       return this.reply(200, this.body(path, this.corrupt(content, fault), fault, signal), tag);
@@ -288,6 +288,10 @@ export function putIncrements(network: Network, { labels, pack }: Manifest): voi
     if (bytes && size > (network.files.get(uri)?.length ?? 0)) network.files.set(uri, new Uint8Array(size));
   }
 }
+
+/** The first and the last byte that a request asks for, as matched; null: for all. */
+export const rangeOf = (init?: RequestInit): RegExpExecArray | null =>
+  /^bytes=(\d+)-(\d+)$/.exec(new Headers(init?.headers).get("Range") ?? "");
 
 /** A short digest (FNV-1a) in place of sha-256, at once. */
 export function fnv(bytes: Uint8Array): string {

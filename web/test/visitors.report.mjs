@@ -33,7 +33,7 @@ const wire = (uri) => {
   return /\.(css|html|js|json)$/.test(uri) ? gzipSync(content, { level: 6 }).length : content.length;
 };
 const html = readFileSync(join(bundle, "index.html"), "utf8");
-// what the page names; the rest comes when it is needed, in these visits never
+// what the page names; the rest comes when it is needed: WebAssembly for more splats than these bundles have
 const page = ["index.html", ...new Set(html.match(/\bassets\/[\w.-]+/g))];
 if (existsSync(join(bundle, "poster.jpg"))) page.push("poster.jpg");
 const served = page.map((uri) => ({ uri, wire: wire(uri) }));

@@ -5,7 +5,7 @@ import type { Fetch } from "../src/core/download";
 import { loadManifest } from "../src/core/manifest";
 import { Streamer } from "../src/core/streamer";
 import type { Level, Manifest, Quat, Settings, Vec3, Viewpoint } from "../src/types";
-import { FakeRenderer, Network, putIncrements, seeded, VirtualClock } from "./simulate";
+import { FakeRenderer, Network, putIncrements, rangeOf, seeded, VirtualClock } from "./simulate";
 import { BASE, frustumOf, lensOf, NO_BUDGET } from "./worlds";
 
 /** A file of a bundle, as a server has it. */
@@ -138,7 +138,7 @@ export interface Request {
 function recording(network: Network, clock: VirtualClock, log: Request[]): Fetch {
   return async (url, init) => {
     const uri = new URL(url).pathname.slice(1);
-    const range = /^bytes=(\d+)-(\d+)$/.exec(new Headers(init?.headers).get("Range") ?? "");
+    const range = rangeOf(init);
     const asked = range ? { asked: Number(range[2]) - Number(range[1]) + 1 } : {};
     const entry: Request = { ms: Math.round(clock.now()), uri, ...asked, bytes: 0 };
     log.push(entry);

@@ -16,9 +16,7 @@ from sagesplat.scene.scene import Scene
 VIDEOS = frozenset(
     {".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".3gp"}
 )
-
 _RUN = "scene.json", "provenance"  # are in every run folder
-SPLATS = frozenset({".ply", ".spz", ".sog", ".ssog", ".splat", ".glb", ".gltf"})
 
 
 @dataclass(frozen=True)
@@ -101,11 +99,7 @@ def _of_file(path: Path) -> str:
         return "stored"
     if suffix in VIDEOS:
         return "video"
-    if suffix in SPLATS:
-        raise SceneError(
-            f"{path}: no capture; if it is a splat, `sagesplat adopt {path} RUN` makes a run of it"
-        )
     raise SceneError(
         f"{path}: neither a transforms .json, an .xml of Metashape nor a video; give one of these, or a "
-        "folder (unpack archives)"
+        f"folder (unpack archives); `sagesplat adopt {path} RUN` is for splats"
     )
