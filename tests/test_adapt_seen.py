@@ -10,9 +10,10 @@ from conftest import pinhole, random_gaussians
 from sagesplat.adapt.ladder import PrefixLadder
 from sagesplat.adapt.observe import RenderedLabels
 from sagesplat.adapt.seen import SeenRecords, seen_from, seen_levels
+from sagesplat.core.errors import DataError
 from sagesplat.core.second_opacity import SecondOpacities
 from sagesplat.formats.levels import write_set
-from sagesplat.raster import Workspace, in_sight, most_painted, rasterize
+from sagesplat.raster import Workspace, cpu, in_sight, most_painted, rasterize
 
 
 @pytest.mark.parametrize("two", [False, True])
@@ -26,7 +27,7 @@ def test_compositions_render_alike(tmp_path, two, antialiased):
     ladder = PrefixLadder(tmp_path / "ladder.npz", sizes)
     camera = pinhole(70, 50)
     how = {"backend": "cpu", "antialiased": antialiased, "workspace": Workspace()}
-    seen, fast = seen_levels(ladder, camera, **how), seen_from(ladder, camera, **how)
+    seen, fast = seen_levels(ladder, camera, **how), seen_from(ladder, camera, **how).kept()
     assert isinstance(fast, SeenRecords)
     assert fast.nbytes == (56 if two else 44) * len(seen.gaussians) + 4 * len(
         fast.drawn.ids
@@ -50,6 +51,19 @@ def test_compositions_render_alike(tmp_path, two, antialiased):
         labels = RenderedLabels(ladder.compose(levels), "cpu", antialiased).render(camera)
         assert (seen.label_ids(levels) == labels).all()
         assert (fast.label_ids(levels) == labels).mean() > 0.999  # what is equal but for rounding
+
+
+def test_projecting_some_at_a_time_changes_no_bit(monkeypatch):
+    g, camera = random_gaussians(300, seed=4), pinhole(70, 50)
+    at_once = cpu.seen(g, camera, Workspace())
+    monkeypatch.setattr(cpu, "_PROJECTED", 67)  # the last part has 32
+    in_parts = cpu.seen(g, camera, Workspace())
+    assert 0 < len(at_once[0]) < 300
+    for one, other in zip((*at_once[:2], at_once[2].ids), (*in_parts[:2], in_parts[2].ids), strict=True):
+        np.testing.assert_array_equal(one, other)
+    g.means[200] = np.nan
+    with pytest.raises(DataError, match="row 200"):
+        cpu.seen(g, camera, Workspace())
 
 
 def test_what_is_in_sight_is_what_has_a_radius():

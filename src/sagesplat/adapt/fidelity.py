@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int16, Int32, UInt16
@@ -20,6 +20,7 @@ from sagesplat.adapt.observe import RenderedLabels, render_rgb
 from sagesplat.adapt.seen import Seen, seen_from
 from sagesplat.core.errors import DataError, short
 from sagesplat.core.gaussians import Gaussians
+from sagesplat.io.array_file import ArrayFile, Stored
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
 from sagesplat.metrics.image import box_of, means_by_label, ssim_map, tiles_around
@@ -192,14 +193,18 @@ class Reference:
         """Colours in [0, 1]."""
         return self.colours if self.colours.dtype == np.float32 else self.colours / _STEPS
 
-    @property
-    def nbytes(self) -> int:
-        """Memory that it holds besides the levels and `image`, about."""
-        return self.colours.nbytes + self.label_ids.nbytes
+
+class _Kept(NamedTuple):
+    """A `Reference` whose pictures are in a file."""
+
+    pictures: tuple[Stored, ...]
+    pixels: np.ndarray
+    levels: Seen | None
+    tile_mask: np.ndarray | None
 
 
 class References:
-    """Compares compositions with the full model; what a viewpoint needs is kept as far as memory allows."""
+    """Compares compositions with the full model; what a viewpoint needs is kept, pictures in a file."""
 
     def __init__(
         self,
@@ -221,7 +226,7 @@ class References:
         self._left, self._left_levels = keep, min(keep, _KEEP_LEVELS)
         self._backend: Backend = backend
         self._given = full
-        self._workspace, self._kept = Workspace(), dict[tuple[object, ...], Reference]()
+        self._workspace, self._kept, self._file = Workspace(), dict[tuple[object, ...], _Kept](), ArrayFile()
 
     @cached_property
     def _last(self) -> RenderedLabels:
@@ -247,16 +252,32 @@ class References:
             compositions = None
         key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
         kept = self._kept.get(key)
-        found = kept or self._pictures(camera, compositions)
+        if kept:
+            found = Reference(*self._file.read(kept.pictures), *kept[1:])
+        else:
+            found = self._pictures(camera, compositions)
         if found.levels is None and isinstance(self._ladder, PrefixLadder):
             found = replace(found, levels=self._seen(camera, found.tile_mask, compositions))
-        if kept is None and found.nbytes <= self._left:
-            self._left -= found.nbytes
-            stays = compositions is None and found.levels and found.levels.nbytes <= self._left_levels
-            if found.levels and stays:
-                self._left_levels -= found.levels.nbytes
-            self._kept[key] = replace(found, levels=found.levels if stays else None)
-        return replace(found)  # what is kept stays without `image`
+        if kept is None:
+            self._keep(key, found, levels=compositions is None)
+        return found
+
+    def _keep(self, key: tuple[object, ...], found: Reference, levels: bool) -> None:
+        """Keep what was found, with the levels, if there is room for it."""
+        nbytes = found.colours.nbytes + found.label_ids.nbytes
+        if nbytes > self._left:
+            return
+        try:
+            pictures = self._file.add(found.colours, found.label_ids)
+        except OSError:  # no room on the disk: what is there serves
+            self._left = 0
+            return
+        self._left -= nbytes
+        stay = None
+        if levels and found.levels and found.levels.nbytes <= self._left_levels:
+            self._left_levels -= found.levels.nbytes
+            stay = found.levels.kept()
+        self._kept[key] = _Kept(pictures, found.pixels, stay, found.tile_mask)
 
     def _seen(
         self,

@@ -21,11 +21,15 @@ Ranges = Mapping[int, tuple[tuple[int, int], ...]]  # first row and last + 1 of 
 
 
 class Seen(Protocol):
-    """The levels of a nested ladder from one camera."""
+    """The levels of a nested ladder from one camera, until the next one's with the same workspace."""
 
     @property
     def nbytes(self) -> int:
         """Memory that they take, about."""
+        ...
+
+    def kept(self) -> "Seen":
+        """The same, which no other overwrites."""
         ...
 
     def render(self, levels: Mapping[int, int]) -> Float32[np.ndarray, "H W 3"]:
@@ -51,6 +55,10 @@ class SeenRecords:
     def nbytes(self) -> int:
         """See `Seen`."""
         return self.drawn.nbytes
+
+    def kept(self) -> "SeenRecords":
+        """See `Seen`."""
+        return replace(self, drawn=self.drawn.kept())
 
     def render(self, levels: Mapping[int, int]) -> Float32[np.ndarray, "H W 3"]:
         """See `Seen`."""
@@ -92,6 +100,10 @@ class SeenLevels:
     def nbytes(self) -> int:
         """Memory that they take, about: 15 float32 values of each Gaussian."""
         return 60 * len(self.gaussians)
+
+    def kept(self) -> "SeenLevels":
+        """See `Seen`."""
+        return self
 
     def compose(self, levels: Mapping[int, int]) -> Gaussians:
         """The union over categories of the Gaussians of each at its level (label id -> level, 1 to K)."""

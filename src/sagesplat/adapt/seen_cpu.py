@@ -27,7 +27,10 @@ _NOWHERE = -30.0  # logit of what is not drawn
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """N Gaussians as a camera draws them, at the larger of two opacities."""
+    """N Gaussians as a camera draws them, at the larger of two opacities.
+
+    `drawn_from` overwrites it when it is called again with the same workspace, but for what `kept` returns.
+    """
 
     records: Float32[np.ndarray, "N 11"]  # see `raster.blend`
     logits: Float32[np.ndarray, "N 2"]  # of the first opacity, and of the second one; no rows without that
@@ -43,6 +46,10 @@ class Drawn:
     def nbytes(self) -> int:
         """Memory that it takes, about."""
         return self.records.nbytes + self.logits.nbytes + self.filtered.nbytes + self.ids.nbytes
+
+    def kept(self) -> "Drawn":
+        """The same in memory of its own."""
+        return replace(self, records=self.records.copy(), ids=self.ids.copy())
 
     def render(self, parts: Sequence[tuple[int, int, float]]) -> Float32[np.ndarray, "H W 3"]:
         """An image in [0, 1] of some rows: of each part the first and last + 1, and the weight of the second
@@ -124,7 +131,9 @@ def drawn_from(
         logits = np.stack([first.numpy()[rows], second.numpy()[rows]], 1)
         opacities = 1 / (1 + np.exp(-logits.max(1).astype(np.float64)))
         filtered = (records[:, 5] - np.log2(opacities)).astype(np.float32)
-    order, starts, ids = lists.row_order, lists.starts, lists.ids.copy()
+    order, starts = lists.row_order, lists.starts
+    ids = workspace.take("seen ids", len(lists.ids), dtype=np.int32)
+    np.copyto(ids, lists.ids)
     return Drawn(records, logits, filtered, order, starts, ids, weights, camera, workspace), rows
 
 

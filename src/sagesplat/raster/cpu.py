@@ -18,6 +18,7 @@ from sagesplat.raster.render import Render
 from sagesplat.scene.scene import Camera
 
 _CHUNK = 3  # channels that one blending pass takes
+_PROJECTED = 1 << 16  # Gaussians at a time whose records are kept where few of them are seen
 _WITHOUT_PLACE = {"logit_opacities", "sh0"}  # their gradients need no projection
 
 _Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # PARAMETERS
@@ -51,7 +52,7 @@ def _enough(*arrays: np.ndarray) -> Any:
     return tuple(np.concatenate([a, a[-1:].repeat(missing, 0)]) for a in arrays)
 
 
-def _project(options: _Options, parameters: _Arrays):
+def _project(options: _Options, parameters: Sequence[np.ndarray], first_row: int = 0):
     n = len(parameters[0])
     parameters = _enough(*parameters)
     rows, take = len(parameters[0]), options.workspace.take
@@ -62,7 +63,8 @@ def _project(options: _Options, parameters: _Arrays):
     if n and radii.min() < 0:
         bad = np.flatnonzero(radii < 0)
         raise DataError(
-            f"{len(bad)} of {n} Gaussians hold NaN or Inf (first row {bad[0]}); drop them before rendering"
+            f"{len(bad)} of {n} Gaussians hold NaN or Inf (first row {first_row + bad[0]}); "
+            "drop them before rendering"
         )
     return records, depths, radii
 
@@ -305,13 +307,21 @@ def seen(
     tile_mask: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, tiles.Intersections]:
     """The rows [M] of the Gaussians that are drawn, their records [M, 11] with the colours that the camera
-    sees, and tile lists of places among them. The lists hold until the next call with the same `workspace`.
+    sees, and tile lists of places among them. The records hold until the next call with the same `workspace`,
+    the lists until anything is rendered with it.
     """
     options = _Options(camera, g.sh_degree, antialiased, tile_mask, workspace)
-    records, depths, radii = _project(options, _arrays([getattr(g, name) for name in PARAMETERS]))
-    rows = np.flatnonzero(radii > 0)
-    records = records.take(rows, 0)  # indexing takes twice as long
-    return rows, records, _intersections(options, records, depths[rows], radii[rows])
+    parameters, n, m = _arrays([getattr(g, name) for name in PARAMETERS]), len(g), 0
+    rows, records = np.empty(n, np.int64), workspace.take("seen records", n, blend.RECORD)
+    depths, radii = np.empty(n, np.float32), np.empty(n, np.float32)
+    for begin in range(0, n, _PROJECTED):
+        of_some = _project(options, [array[begin : begin + _PROJECTED] for array in parameters], begin)
+        shown = np.flatnonzero(of_some[-1] > 0)
+        kept = slice(m, m := m + len(shown))
+        rows[kept] = begin + shown
+        for array, found in zip((records, depths, radii), of_some, strict=True):
+            found.take(shown, 0, out=array[kept], mode="clip")  # other modes fill an array of their own
+    return rows[:m], records[:m], _intersections(options, records[:m], depths[:m], radii[:m])
 
 
 def most_painted(
