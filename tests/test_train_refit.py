@@ -9,7 +9,7 @@ from conftest import orbit, random_gaussians
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sagesplat.core.gaussians import concat
+from sagesplat.core.gaussians import concat, gather
 from sagesplat.formats.levels import starts_of
 from sagesplat.raster import rasterize
 from sagesplat.scene.points import untracked
@@ -19,6 +19,7 @@ from sagesplat.train.lower_levels import (
     Set,
     assemble,
     by_label,
+    counts_of_first,
     first_of_all,
     in_cells,
     joined,
@@ -164,3 +165,13 @@ def test_mixed_levels_of_cells_lie_between_the_two(monkeypatch: pytest.MonkeyPat
     # where cells of other levels meet, what overlaps can cost a little more than one cell's upgrade brings
     assert max(errors) < 1.05 * worst
     assert errors[-1] < 0.5 * worst
+
+
+def test_gathered_are_those_of_concat_and_counted_ones_those_selected():
+    low, g = random_gaussians(20, degree=0), random_gaussians(30, degree=2)
+    rows = torch.tensor([7, 3, 3, 11]), torch.arange(30).flip(0)
+    expected = concat([low.select(rows[0]), g.select(rows[1])])
+    for name, values in vars(gather([(low, rows[0]), (g, rows[1])])).items():
+        assert torch.equal(values, getattr(expected, name)), name
+    for share in (0.1, 0.5, 1.0):
+        assert counts_of_first(g, share, {0: 2}) == first_of_all(g, share, {0: 2}).counts()

@@ -165,6 +165,24 @@ def relabelled(g: Gaussians, label_of: Mapping[int, int]) -> Gaussians:
     return replace(g, label_ids=after[torch.searchsorted(before, g.label_ids)])
 
 
+def gather(parts: Sequence[tuple[Gaussians, Tensor]]) -> Gaussians:
+    """The Gaussians at some rows (int64) of several sets, in order, as `concat` has them; no other copy is
+    made on the way.
+    """
+    sizes = [len(rows) for _, rows in parts]
+    bases, found = max(g.shN.shape[1] for g, _ in parts), dict[str, Tensor]()
+    for name in (f.name for f in fields(Gaussians)):
+        values = [getattr(g, name) for g, _ in parts]
+        shape = (bases, 3) if name == "shN" else values[0].shape[1:]
+        found[name] = values[0].new_zeros((sum(sizes), *shape))
+        for all_of_it, (_, rows), out in zip(values, parts, found[name].split(sizes), strict=True):
+            if out.shape[1:] == all_of_it.shape[1:]:
+                torch.index_select(all_of_it, 0, rows, out=out)
+            else:
+                out[:, : all_of_it.shape[1]] = all_of_it[rows]
+    return Gaussians(**found)
+
+
 def concat(parts: Sequence[Gaussians]) -> Gaussians:
     """The Gaussians of several sets, in order; shN is zero-padded to the largest degree."""
     bases = max(p.shN.shape[1] for p in parts)

@@ -37,6 +37,7 @@ from sagesplat.train.lower_levels import (
     Rung,
     Set,
     assemble,
+    counts_of_first,
     first_of_all,
     in_cells,
     joined,
@@ -61,8 +62,8 @@ _COMPARE = 8  # views that merged Gaussians and prefixes of the originals are co
 def make_levels(job: Job, config: AdoptConfig) -> None:
     """Make the ladder of an adopted splat, and its increments."""
     run = job.run
-    g = job.load_last_level()
-    shares = usable_shares(config.shares, len(g))
+    count = sum(job.last_level.counts.values())
+    shares = usable_shares(config.shares, count)
     steps = config.steps if config.fit == "renders" else 0
     made_as = NestConfig(steps=steps, levels=len(shares), base_share=0, cells=config.cells, rate_weight=0.0)
     settings = asdict(made_as)
@@ -72,14 +73,15 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
 
     def make() -> list[str]:
         if config.fit == "renders":
-            check_nest(job, len(g), g.sh_degree)
-        ladder, num_lower = _ladder(job, g, shares, config, checkpoint_key(run, settings, inputs))
-        ladder, label_of = in_cells(ladder, cells_wanted(len(g), config.cells))
-        rows, space = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace()
+            check_nest(job, count, job.last_level.sh_degree)
+        rows, space, g = spread(job.scene.train_ids.tolist(), _COMPARE), Workspace(), job.load_last_level()
         came_in = [(row, _image(job, g, row, space)) for row in rows]
         precision = None if config.lossless else _precision(job, g, came_in)
+        del g, space  # of millions of Gaussians; so is what follows
+        ladder, num_lower = _ladder(job, shares, config, checkpoint_key(run, settings, inputs))
+        ladder, label_of = in_cells(ladder, cells_wanted(count, config.cells))
         made, replaces = _streams(job, ladder, label_of, precision), ladder.replaces
-        del ladder  # of millions of Gaussians: what is read back takes as much
+        del ladder  # what is read back takes as much
         lines = _prefixes(job, made, replaces, label_of, num_lower, came_in, settings)
         remove_checkpoints(run.nest_checkpoint)
         return lines
@@ -87,22 +89,22 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.cells, run.increments], make, swaps=True)
 
 
-def _ladder(
-    job: Job, g: Gaussians, shares: Sequence[float], config: AdoptConfig, key: str
-) -> tuple[Assembled, int]:
+def _ladder(job: Job, shares: Sequence[float], config: AdoptConfig, key: str) -> tuple[Assembled, int]:
     """All levels, and how many of them are not prefixes of the originals."""
-    targets = Renders(g, job.scene.views, job.backend, job.antialiased, photo_cache(job.memory_limit))
-    views = spread(job.scene.train_ids.tolist(), _WEIGH)
+    g, views = job.load_last_level(), spread(job.scene.train_ids.tolist(), _WEIGH)
     weights = importance(g, job.scene, views, "weight", antialiased=job.antialiased)
     order = importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased)
     ordered = g.select(torch.from_numpy(np.argsort(-order, kind="stable")))
     rungs = merged_rungs(g, weights, shares[:-1])
+    del g
+    targets = Renders(ordered, job.scene.views, job.backend, job.antialiased, photo_cache(job.memory_limit))
     sets = _lower_levels(job, targets, ordered, rungs, views, config, key)
+    del rungs
     num_lower = sum(len(one.levels) for one in sets)
     least: Counts = sets[-1].levels[-1] if sets else {}
     levels = list[Counts]()
     for share in shares[num_lower:]:
-        least = first_of_all(ordered, share, least).counts()
+        least = counts_of_first(ordered, share, least)
         levels.append(least)
     return assemble([*sets, Set(ordered, tuple(levels))]), num_lower
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from sagesplat.core.gaussians import Gaussians, concat
+from sagesplat.core.gaussians import Gaussians, concat, gather
 from sagesplat.train.cells import split_cells
 from sagesplat.train.merging import merge
 from sagesplat.train.nested import Nested, Spans
@@ -77,10 +77,20 @@ def merged_rungs(g: Gaussians, weights: np.ndarray, shares: Sequence[float]) -> 
 
 def first_of_all(ordered: Gaussians, share: float, least: Counts) -> Gaussians:
     """The first Gaussians, `share` of all, with at least `least` and one of each category."""
+    return ordered.select(torch.from_numpy(_first(ordered, share, least)))
+
+
+def counts_of_first(ordered: Gaussians, share: float, least: Counts) -> Counts:
+    """How many of each category `first_of_all` has."""
+    labels, counts = np.unique(ordered.label_ids[_first(ordered, share, least)], return_counts=True)
+    return dict(zip(labels.tolist(), counts.tolist(), strict=True))
+
+
+def _first(ordered: Gaussians, share: float, least: Counts) -> np.ndarray:
     kept = np.arange(len(ordered)) < size_of(share, len(ordered))
     for label, rows in by_label(ordered).items():
         kept[rows[: max(1, least.get(label, 0))]] = True
-    return ordered.select(torch.from_numpy(kept))
+    return kept
 
 
 def trained_sets(shares: Sequence[float]) -> list[tuple[float, ...]]:
@@ -133,9 +143,9 @@ def assemble(sets: Sequence[Set]) -> Assembled:
                 replacing.append(len(ends) + 1)
             ends += [begin + counts[label] for counts in one.levels]
             begin = ends[-1]
-            parts.append(one.gaussians.select(torch.from_numpy(mine[label])))
+            parts.append((one.gaussians, torch.from_numpy(mine[label])))
         sizes[label], replaces[label] = tuple(ends), tuple(replacing)
-    return Assembled(concat(parts), sizes, replaces)
+    return Assembled(gather(parts), sizes, replaces)
 
 
 def in_cells(ladder: Assembled, count: int) -> tuple[Assembled, dict[int, int]]:
