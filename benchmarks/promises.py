@@ -45,14 +45,15 @@ def _built_in(**options: Any) -> Callable[[Path], Path]:
 
 
 _SHORT = RunConfig(scene=SceneConfig(downscale=2), train=TrainConfig(max_steps=2000))
+_SMALL = {"width": 320, "height": 240}
 CASES = {
     "garden": Case(_real("garden"), _SHORT),
     "dinosaur": Case(_real("dinosaur"), _SHORT),
-    "built-in-11": Case(_built_in(seed=11), DEMO),
-    "built-in-12": Case(_built_in(seed=12, views=90), DEMO),
+    "built-in-11": Case(_built_in(seed=11, **_SMALL), DEMO),
+    "built-in-12": Case(_built_in(seed=12, views=90, **_SMALL), DEMO),
     "built-in-2x1": Case(_built_in(seed=13, places=(2, 1), views=150, width=256, height=192), DEMO),
-    "built-in-21": Case(_built_in(seed=21), DEMO),
-    "built-in-22": Case(_built_in(seed=22, views=90), DEMO),
+    "built-in-21": Case(_built_in(seed=21, **_SMALL), DEMO),
+    "built-in-22": Case(_built_in(seed=22, views=90, **_SMALL), DEMO),
     "built-in-23": Case(_built_in(seed=23, places=(2, 1), views=150, width=256, height=192), DEMO),
 }
 
