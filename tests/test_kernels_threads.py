@@ -45,16 +45,16 @@ def test_images_are_compared_at_once_with_the_same_bits(two_threads):
     rng = np.random.default_rng(0)
     pairs = [rng.random((2, 150, 200, 3), np.float32) for _ in range(12)]
     alone = [ssim_map(*pair) for pair in pairs]
-    names, counts = set(), set()
+    counts, both = set(), threading.Barrier(2)
 
-    def compare(pair):
-        names.add(threading.get_ident())
+    def compare(row):
+        if row in (1, 2):  # the first that are divided: in one thread the other would never come
+            both.wait(timeout=60)
         counts.add(numba.get_num_threads())
-        return ssim_map(*pair)
+        return ssim_map(*pairs[row])
 
-    found = list(side_by_side(compare, pairs))
+    found = list(side_by_side(compare, range(len(pairs))))
     assert all(np.array_equal(a, b) for a, b in zip(alone, found, strict=True))
-    assert len(names) > 1, "all in one thread"
     assert counts == {1, 2}, "the first alone with both threads, the others with one each"
     assert numba.get_num_threads() == 2
     assert torch.get_num_threads() == 2
