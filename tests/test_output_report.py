@@ -284,6 +284,7 @@ def whole(tmp_path_factory) -> Path:
 
 def test_a_map_of_shares_that_are_all_alike_has_the_whole_scale():
     place = whole_page().drawn_at
+    assert place is not None
     for share in (1.0, np.nan):
         figure = viewpoint_map(place, np.full(10, share))
         assert {

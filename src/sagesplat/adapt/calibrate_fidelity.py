@@ -222,7 +222,8 @@ def _by_place(
 
     if len(of_kinds) == 1:
         slopes = np.maximum(np.interp(TARGETS, model.calibration.targets, model.calibration.slopes), 0)
-        return _with_needs(model, *at_a_photo(slopes), slopes)
+        (needs,) = at_a_photo(slopes)
+        return _with_needs(model, needs, slopes)
     low, high = np.zeros(len(TARGETS)), np.full(len(TARGETS), _STEEPEST)
     for _ in range(_HALVINGS):
         slopes = (low + high) / 2

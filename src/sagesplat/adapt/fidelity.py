@@ -253,7 +253,8 @@ class References:
         key = camera.w2c.tobytes(), camera.K.tobytes(), camera.width, camera.height, camera.background
         kept = self._kept.get(key)
         if kept:
-            found = Reference(*self._file.read(kept.pictures), *kept[1:])
+            colours, label_ids = self._file.read(kept.pictures)
+            found = Reference(colours, label_ids, kept.pixels, kept.levels, kept.tile_mask)
         else:
             found = self._pictures(camera, compositions)
         if found.levels is None and isinstance(self._ladder, PrefixLadder):

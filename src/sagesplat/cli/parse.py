@@ -140,7 +140,9 @@ def _with_defaults(function: Callable[..., None], values: Mapping[str, Any]) -> 
 
 def _without_dicts(value: Any) -> Any:
     """Settings without the entries of dictionaries: tyro takes a default's keys for the only ones."""
-    return replace(value, **{name: {} for name in _dicts(value)}) if is_dataclass(value) else value
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    return replace(value, **{name: {} for name in _dicts(value)})
 
 
 def _with_dicts(values: dict[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
