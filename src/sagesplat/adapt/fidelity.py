@@ -28,7 +28,7 @@ from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 
-_KEEP = 4 * 10**8  # bytes of the full model's pictures that are kept: plans look where models were fitted
+_KEEP = 4 * 10**8  # bytes of a file of the full model's pictures: plans look where models were fitted
 _STEPS = np.float32(2**16 - 1)  # of colours in them: half the memory, and SSIM is the same to 3e-6
 _SEEN_BYTES = 44  # of a Gaussian in what its levels are rendered from
 _KEEP_LEVELS = 10**8  # of what levels are rendered from: for many Gaussians it takes as much as 20 pictures

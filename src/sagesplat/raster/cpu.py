@@ -18,7 +18,7 @@ from sagesplat.raster.render import Render
 from sagesplat.scene.scene import Camera
 
 _CHUNK = 3  # channels that one blending pass takes
-_PROJECTED = 1 << 16  # Gaussians at a time whose records are kept where few of them are seen
+_PROJECTED = 1 << 16  # Gaussians that `seen` projects at a time: only records of what is drawn are kept
 _WITHOUT_PLACE = {"logit_opacities", "sh0"}  # their gradients need no projection
 
 _Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # PARAMETERS
