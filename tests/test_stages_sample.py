@@ -71,8 +71,9 @@ def test_the_levels_are_compared_with_the_full_model(job: Job):
     planned = np.array([[[1, 1], [4, 4], [1, 4], [4, 4]]] * 2)
     composed, same = measure_compositions(job.ladder, cameras, planned, backend="cpu")
     assert (same == pixels).all()
-    np.testing.assert_allclose(composed[:, 0, :-1], found[..., 0], atol=1e-6)
-    np.testing.assert_allclose(composed[:, 1, -1], 1, atol=1e-6)
+    # float32 of the same Gaussians in another order: one machine in many is 1.07e-6 away
+    np.testing.assert_allclose(composed[:, 0, :-1], found[..., 0], atol=4e-6)
+    np.testing.assert_allclose(composed[:, 1, -1], 1, atol=4e-6)
     np.testing.assert_array_equal(composed[:, 1], composed[:, 3])
 
 
