@@ -1,5 +1,5 @@
 // How fast streams are decoded, in millions of Gaussians a second: node test/decode.report.mjs FOLDER [ROUNDS]
-// [PAGE.html], which is a page to write that measures the same in a browser, as its title.
+// [PAGE.html], which is a page to write that measures the same in a browser, as its title: itself, and two workers.
 
 import { readdirSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
@@ -18,9 +18,17 @@ const names = readdirSync(folder).filter((name) => name.endsWith(".sgst"));
 const streams = names.map((name) => readFileSync(join(folder, name)));
 if (page) {
   const data = JSON.stringify(streams.map((stream) => stream.toString("base64")));
-  const measure = `decoding.decodeSpeed(${data}.map((t) => Uint8Array.from(atob(t), (c) => c.charCodeAt(0))), ${rounds})`;
-  writeFileSync(page, `<script>${code};document.title = JSON.stringify(${measure})</script>\n`);
+  writeFileSync(
+    page,
+    `<script type="module">
+${code}
+const streams = ${data}.map((t) => Uint8Array.from(atob(t), (c) => c.charCodeAt(0)));
+const speed = (workers) => decoding.decodeSpeed(streams, ${rounds}, workers);
+document.title = JSON.stringify({ page: await speed(0), workers: await speed(2) });
+</script>
+`,
+  );
 } else {
   const { decodeSpeed } = new Function(`${code};return decoding`)();
-  console.log(JSON.stringify(decodeSpeed(streams, Number(rounds))));
+  console.log(JSON.stringify(await decodeSpeed(streams, Number(rounds), 0)));
 }

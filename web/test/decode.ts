@@ -1,16 +1,20 @@
-/** How fast coded streams are decoded to what the GPU reads. */
+/** How fast coded streams are decoded to what the GPU reads, as the viewer does it. */
 
 import { HEADER_BYTES, readHeader } from "../src/core/header";
-import { Palette } from "../src/core/palette";
-import { StreamDecoder } from "../src/core/stream";
-import { Packing } from "../src/view/packing";
+import { Decoders, type PaletteBytes } from "../src/view/decoding";
+import StreamWorker from "../src/view/decoding.worker?worker&inline";
 import { endOfPalette } from "./fuzz";
 
+interface Stream {
+  readonly palette: PaletteBytes | undefined;
+  readonly increments: readonly Uint8Array[]; // levels that have Gaussians
+}
+
 /** The streams of a file, which lie one after the other, and the palette before them. */
-export function streamsOf(file: Uint8Array): { palette: Palette | null; stream: Uint8Array }[] {
-  const found: { palette: Palette | null; stream: Uint8Array }[] = [];
+function streamsOf(file: Uint8Array, name: number): Stream[] {
+  const found: Stream[] = [];
   let at = endOfPalette(file);
-  const palette = at ? new Palette(file.subarray(0, at)) : null;
+  const palette = at ? { sha256: String(name), bytes: file.slice(0, at) } : undefined;
   const number = () => {
     let value = 0;
     for (let shift = 0; ; shift += 7) {
@@ -20,31 +24,46 @@ export function streamsOf(file: Uint8Array): { palette: Palette | null; stream: 
     }
   };
   while (at < file.length) {
-    const start = at;
+    const ends = [at];
     const { levels, twoOpacities } = readHeader(file.subarray(at));
     at += HEADER_BYTES;
     for (let level = 0; level < levels; level++) {
-      number();
+      const count = number();
       const size = number(); // before `at` is read: it moves
       at += Number(twoOpacities) + size;
+      if (count) ends.push(at);
     }
-    found.push({ palette, stream: file.subarray(start, at) });
+    ends[ends.length - 1] = at; // empty levels go with the next one, or with the last
+    found.push({ palette, increments: ends.slice(1).map((end, i) => file.slice(ends[i], end)) });
   }
   return found;
 }
 
-/** Millions of Gaussians a second: of the first round, the best one and the median. */
-export function decodeSpeed(files: readonly Uint8Array[], rounds: number): Record<string, number> {
+/**
+ * Millions of Gaussians a second: of the first round, the best one and the median.
+ *
+ * @param workers - that decode; 0: this thread does
+ */
+export async function decodeSpeed(files: readonly Uint8Array[], rounds: number, workers: number) {
+  const streams = files.flatMap(streamsOf);
+  const decoders = new Decoders((answered, failed) => {
+    if (!workers) throw new Error("none are wanted");
+    const worker = new StreamWorker();
+    worker.onmessage = ({ data }) => answered(data);
+    worker.onerror = failed;
+    return worker;
+  }, workers || 1);
   const times: number[] = [];
   let count = 0;
   for (let round = 0; round < rounds; round++) {
     const begun = performance.now();
-    count = 0;
-    for (const { palette, stream } of files.flatMap(streamsOf)) {
-      for (const part of new StreamDecoder(new Packing(), palette).push(stream)) count += part.count;
-    }
+    const parts = streams.flatMap(({ palette, increments }, stream) =>
+      increments.map((_, i) => decoders.decode(stream, increments.slice(0, i + 1), palette)),
+    );
+    count = (await Promise.all(parts)).reduce((sum, part) => sum + part.count, 0);
     times.push(performance.now() - begun);
   }
+  decoders.close();
   const [first] = times as [number];
   times.sort((a, b) => a - b);
   const speed = (ms: number) => Math.round(count / ms / 10) / 100;

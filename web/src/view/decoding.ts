@@ -1,4 +1,4 @@
-/** Decodes coded streams in a worker, or on the page's own thread where there is none. */
+/** Decodes coded streams in workers, or on the page's own thread where there are none. */
 
 import { Palette } from "../core/palette";
 import { StreamDecoder } from "../core/stream";
@@ -59,12 +59,12 @@ export class Streams {
 
 /** The subset of `Worker` that is used here. */
 export interface Peer {
-  postMessage(message: Job): void;
+  postMessage(jobs: readonly Job[]): void;
   terminate(): void;
 }
 
 /** Starts a worker; throws where none can be had. */
-export type Start = (answered: (answer: Answer) => void, failed: () => void) => Peer;
+export type Start = (answered: (answers: readonly Answer[]) => void, failed: () => void) => Peer;
 
 interface Waiting {
   readonly stream: number;
@@ -73,15 +73,14 @@ interface Waiting {
   readonly done: (part: Part | null) => void;
 }
 
-/** Decodes the levels of several streams. */
+/** Decodes the levels of several streams, each by one of several workers. */
 export class Decoders {
-  private peer: Peer | null = null;
-  private own: Streams | null = null; // where no worker can be had
-  private jobs = 0;
-  private readonly waiting = new Map<number, Waiting>();
-  private readonly done = new Map<number, number>(); // increments decoded, by stream
+  private readonly all: readonly Decoder[];
+  private readonly byStream = new Map<number, Decoder>();
 
-  constructor(private readonly start: Start) {}
+  constructor(start: Start, workers: number) {
+    this.all = Array.from({ length: workers }, () => new Decoder(start));
+  }
 
   /**
    * Decodes the newest of the increments; rejects for a damaged stream.
@@ -90,6 +89,29 @@ export class Decoders {
    * @param increments - of the stream, from the first one to the one that is asked for
    * @param palette - of its file, if it needs one
    */
+  decode(stream: number, increments: readonly Uint8Array[], palette?: PaletteBytes): Promise<Part> {
+    const next = this.all[this.byStream.size % this.all.length] as Decoder;
+    const decoder = this.byStream.get(stream) ?? next;
+    this.byStream.set(stream, decoder);
+    return decoder.decode(stream, increments, palette);
+  }
+
+  close(): void {
+    for (const decoder of this.all) decoder.close();
+  }
+}
+
+/** One worker, and what it was sent. */
+class Decoder {
+  private peer: Peer | null = null;
+  private own: Streams | null = null; // where no worker can be had
+  private jobs = 0;
+  private outbox: Job[] = []; // asked for at once, sent at once: a message takes as long as 100 Gaussians
+  private readonly waiting = new Map<number, Waiting>();
+  private readonly done = new Map<number, number>(); // increments decoded, by stream
+
+  constructor(private readonly start: Start) {}
+
   decode(stream: number, increments: readonly Uint8Array[], palette?: PaletteBytes): Promise<Part> {
     return new Promise((resolve, reject) => {
       const done = (part: Part | null) => {
@@ -107,6 +129,7 @@ export class Decoders {
     this.peer?.terminate();
     this.peer = null;
     this.own = null;
+    this.outbox = [];
     this.waiting.clear();
     this.done.clear();
   }
@@ -124,9 +147,17 @@ export class Decoders {
       increments: increments.slice(from),
       ...(!from && palette && { palette }),
     };
+    if (!this.outbox.length) queueMicrotask(() => this.post());
+    this.outbox.push(message);
+  }
+
+  private post(): void {
+    const jobs = this.outbox;
+    this.outbox = [];
+    if (!jobs.length) return;
     const peer = this.worker();
-    if (peer) peer.postMessage(message);
-    else if (this.own) this.take(this.own.answer(message));
+    if (peer) peer.postMessage(jobs);
+    else if (this.own) for (const job of jobs) this.take(this.own.answer(job));
   }
 
   private take({ id, part }: Answer): void {
@@ -139,7 +170,9 @@ export class Decoders {
     if (this.peer || this.own) return this.peer;
     try {
       this.peer = this.start(
-        (answer) => this.take(answer),
+        (answers) => {
+          for (const answer of answers) this.take(answer);
+        },
         () => this.fallBack(),
       );
     } catch {
@@ -153,6 +186,7 @@ export class Decoders {
     this.peer?.terminate();
     this.peer = null;
     this.own = new Streams();
+    this.outbox = [];
     this.done.clear();
     for (const id of [...this.waiting.keys()]) this.send(id, 0);
   }

@@ -66,7 +66,7 @@ export class SparkLayer implements Renderer {
   readonly #colors = new Map<number, string>();
   readonly #hidden = new Set<number>(); // labels
   readonly #weights: ReadonlyMap<number, readonly (number | undefined)[]>; // of second opacities, by cell and level
-  readonly #decoders = new Decoders(startWorker);
+  readonly #decoders = new Decoders(startWorker, workers());
   readonly #tint = new dyno.DynoFloat({ value: 0 });
   readonly #dirty: () => void;
 
@@ -357,7 +357,10 @@ function lit(word: number): number {
   return mixed >>> 0;
 }
 
-function startWorker(answered: (answer: Answer) => void, failed: () => void): Worker {
+/** How many decode at once: half of the cores, as the page draws meanwhile and others sort. */
+const workers = () => Math.max(2, Math.min(navigator.hardwareConcurrency >> 1, 4));
+
+function startWorker(answered: (answers: readonly Answer[]) => void, failed: () => void): Worker {
   const worker = new StreamWorker();
   worker.onmessage = ({ data }) => answered(data);
   worker.onerror = failed;

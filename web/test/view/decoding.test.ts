@@ -22,27 +22,31 @@ class FakeWorker {
   dead = false;
   closed = false;
   constructor(
-    readonly answered: (answer: Answer) => void,
+    readonly answered: (answers: readonly Answer[]) => void,
     readonly failed: () => void,
   ) {}
-  postMessage(job: Job): void {
-    this.jobs.push(structuredClone(job));
-    queueMicrotask(
-      () => !this.closed && (this.dead ? this.failed() : this.answered(this.streams.answer(job))),
-    );
+  messages = 0;
+  postMessage(jobs: readonly Job[]): void {
+    this.messages++;
+    this.jobs.push(...structuredClone(jobs));
+    queueMicrotask(() => {
+      if (this.closed) return;
+      if (this.dead) this.failed();
+      else this.answered(jobs.map((job) => this.streams.answer(job)));
+    });
   }
   terminate(): void {
     this.closed = true;
   }
 }
 
-function made() {
+function made(count = 1) {
   const workers: FakeWorker[] = [];
   const decoders = new Decoders((answered, failed) => {
     const worker = new FakeWorker(answered, failed);
     workers.push(worker);
     return worker;
-  });
+  }, count);
   const worker = () => workers[0] as FakeWorker;
   return { decoders, worker, workers };
 }
@@ -77,13 +81,29 @@ test("an earlier level is decoded again from what was kept", async () => {
 });
 
 test("streams do not mix", async () => {
-  const { decoders } = made();
+  const { decoders, worker } = made();
   const both = many.slice(0, 2).map(ranges);
   const parts = both.map(({ increments }, stream) => decoders.decode(stream, increments.slice(0, 1)));
   await Promise.all(parts);
+  expect(worker().messages).toBe(1); // what is asked for at once goes at once
   for (const [stream, { increments, counts }] of both.entries()) {
     expect((await decoders.decode(stream, increments.slice(0, 2))).count).toBe(counts[1]);
   }
+});
+
+test("streams are shared out to the workers, and each stays where it began", async () => {
+  const { decoders, workers } = made(3);
+  const { increments, counts } = ranges(golden.find(({ name }) => name.startsWith("degree 3")) as Golden);
+  for (let level = 1; level <= counts.length; level++) {
+    for (const stream of [0, 32, 64, 96]) await decoders.decode(stream, increments.slice(0, level));
+  }
+  const jobs = workers.map((worker) => worker.jobs);
+  expect(jobs.map((own) => new Set(own.map(({ stream }) => stream)))).toEqual(
+    [[0, 96], [32], [64]].map((own) => new Set(own)),
+  );
+  expect(jobs.flat().filter(({ from }) => !from).length).toBe(4);
+  decoders.close();
+  expect(workers.every(({ closed }) => closed)).toBe(true);
 });
 
 test("a damaged level is an error, and the next one begins anew", async () => {
@@ -101,11 +121,21 @@ test("a damaged level is an error, and the next one begins anew", async () => {
 test("without workers the page decodes itself", async () => {
   const decoders = new Decoders(() => {
     throw new Error("blob: is not allowed");
-  });
+  }, 2);
   const { increments, counts } = ranges(many[0] as Golden);
   for (const [i, count] of counts.entries()) {
     expect((await decoders.decode(1, increments.slice(0, i + 1))).count).toBe(count);
   }
+});
+
+test("a worker that fails between two messages loses nothing", async () => {
+  const { decoders, worker } = made();
+  const { increments, counts } = ranges(many[1] as Golden);
+  await decoders.decode(1, increments.slice(0, 1));
+  const second = decoders.decode(1, increments.slice(0, 2));
+  worker().failed(); // before the message with the second level is posted
+  const other = decoders.decode(2, increments.slice(0, 1));
+  expect((await Promise.all([second, other])).map(({ count }) => count)).toEqual([counts[1], counts[0]]);
 });
 
 test("a worker that fails is replaced by the page, for what it had decoded too", async () => {
@@ -120,14 +150,18 @@ test("a worker that fails is replaced by the page, for what it had decoded too",
 });
 
 test("nothing comes after the end", async () => {
-  const { decoders, worker } = made();
+  const { decoders, worker, workers } = made();
   let answered = false;
   const { increments } = ranges(many[0] as Golden);
   void decoders.decode(1, increments.slice(0, 1)).then(() => {
     answered = true;
   });
+  await Promise.resolve(); // the message is posted
+  void decoders.decode(2, increments.slice(0, 1)); // and this one is not
   decoders.close();
   await settled();
   expect(worker().closed).toBe(true);
+  expect(worker().jobs.length).toBe(1);
+  expect(workers.length).toBe(1);
   expect(answered).toBe(false);
 });
