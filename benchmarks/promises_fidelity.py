@@ -106,12 +106,10 @@ def by_condition(
     The perfect planner knows the fidelity of every cell at every level, all at one, and takes the levels of
     the fewest bytes by which each category reaches the target.
     """
-    method, rule, names = NestedLevels(job), viewpoints_of(job).rule, job.names()
+    method, names = NestedLevels(job), job.names()
     labels, costs, targets, found = list(method.costs.labels), method.cell_costs, np.array(TARGETS), {}
-    for name, (places, screen, lens) in conditions.items():
-        drawn = replace(rule, seed=rule.seed + seed, places=places, screens=(screen, screen), fov=1.0)
-        cameras = draw(job.scene, capture_cameras(job.scene), drawn, {"test": views}).cameras
-        cameras = [through(camera, *lens) for camera in cameras] if lens else cameras
+    for name, condition in conditions.items():
+        cameras = cameras_of(job, condition, views, seed)
         expected = method.expect(cameras)
         planned = plan_nominal(method.fidelity, expected, costs.transfer_bytes, targets)
         got, pixels = compositions_at(
@@ -133,6 +131,14 @@ def by_condition(
             }  # fmt: skip
         found[name] = rows
     return found
+
+
+def cameras_of(job: Job, condition: Condition, views: int, seed: int = 91_000) -> list[Camera]:
+    """Fresh viewpoints of a condition, by the run's rule but for it."""
+    rule, (places, screen, lens) = viewpoints_of(job).rule, condition
+    drawn = replace(rule, seed=rule.seed + seed, places=places, screens=(screen, screen), fov=1.0)
+    cameras = draw(job.scene, capture_cameras(job.scene), drawn, {"test": views}).cameras
+    return [through(camera, *lens) for camera in cameras] if lens else list(cameras)
 
 
 def through(camera: Camera, ratio: float, fov: float) -> Camera:
@@ -178,9 +184,17 @@ def _coverage(
     kept = (got >= target) & counts
     best = (uniform >= target).argmax(1)
     perfect = np.take_along_axis(uniform, best[:, None], 1)[:, 0]
+    return shares_kept(kept, counts, names) | {
+        "excess": float((got - target)[counts].mean()),
+        "perfect": float((perfect - target)[counts].mean()),
+    }
+
+
+def shares_kept(kept: np.ndarray, counts: np.ndarray, names: Sequence[str]) -> dict[str, Any]:
+    """Share of decisions [V, L] that are kept, with its interval by a bootstrap of viewpoints."""
     by_view = kept.sum(1), counts.sum(1)
     rng = np.random.default_rng(0)
-    draws = rng.integers(len(got), size=(_DRAWS, len(got)))
+    draws = rng.integers(len(kept), size=(_DRAWS, len(kept)))
     spread = by_view[0][draws].sum(1) / np.maximum(by_view[1][draws].sum(1), 1)
     by_category = {
         name: [int(kept[:, i].sum()), int(counts[:, i].sum())]
@@ -191,8 +205,6 @@ def _coverage(
         "decisions": int(counts.sum()),
         "kept": float(kept.sum() / counts.sum()),
         "interval": np.quantile(spread, [0.025, 0.975]).tolist(),
-        "excess": float((got - target)[counts].mean()),
-        "perfect": float((perfect - target)[counts].mean()),
         "by_category": by_category,
     }
 
