@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -175,8 +176,24 @@ def test_a_run_is_measured_on_the_same_walk_each_time(finished_run, tmp_path, ca
     levels, counts = within_budgets(job, cameras, shares), NestedLevels(job).cell_costs.count
     assert levels.shape == (3, len(shares), len(job.cells.ids))
     assert (np.diff(levels.sum(2), axis=1) >= 0).all()
+    assert levels.min() == 1  # all are in sight
     taken = counts[np.arange(levels.shape[2]), levels - 1].sum(2)
     assert (taken <= np.maximum(np.array(shares) * counts[:, -1].sum(), counts[:, 0].sum())).all()
+
+
+def test_within_few_splats_cells_out_of_sight_are_left_out(finished_run):
+    job = opened(finished_run)
+    away = np.eye(4, dtype=np.float32)
+    away[0, 0] = away[2, 2] = -1  # turned round
+    camera = job.scene.views[0].camera.neutral
+    cameras = [camera, replace(camera, w2c=away @ camera.w2c)]
+    lowest = NestedLevels(job).cell_costs.count
+    share = (lowest[:, 0].sum() - 1) / lowest[:, -1].sum()
+    unseen = ~(NestedLevels(job).expect(cameras).share > 0)
+    assert unseen.any()
+    levels = within_budgets(job, cameras, (share,))[:, 0]
+    np.testing.assert_array_equal((levels == 0).any(1), unseen.any(1))
+    assert not (levels == 0)[~unseen].any()
 
 
 def test_what_has_come_counts_in_all_levels_that_hold_it(finished_run):

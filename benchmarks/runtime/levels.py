@@ -19,7 +19,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.scene import Camera
 from sagesplat.stages.bundle import bundle
 from sagesplat.stages.methods import NestedLevels
-from sagesplat.stages.results import increments_of
+from sagesplat.stages.results import cells_of, increments_of
 
 # what a byte that has come counts in the next plan for a target, as in web/src/core/residency.ts
 THERE = 0.25
@@ -58,16 +58,28 @@ class Pieces:
 
 
 def within_budgets(job: Job, cameras: Sequence[Camera], shares: Sequence[float]) -> np.ndarray:
-    """The planner's levels of cells, int [F, J, C] from 1 to K, within shares of all splats."""
-    method = NestedLevels(job)
+    """The planner's levels of cells, int [F, J, C] from 1 to K, within shares of all splats.
+
+    As in the viewer (web/src/core/planner.ts), where not even the lowest levels fit, cells out of sight are
+    left out (0), those of the least apparent size first.
+    """
+    method, cells = NestedLevels(job), cells_of(job)
     expected, cost = method.expect(cameras), method.cell_costs.count
-    budgets = [share * float(cost[:, -1].sum()) for share in shares]
-    return np.array(
-        [
-            [within(cost, mean, share, budget) + 1 for budget in budgets]
-            for mean, share in zip(expected.mean, expected.share, strict=True)
-        ]
-    )
+    points, areas = cells.points(), cells.areas()
+    found = np.zeros((len(cameras), len(shares), len(cost)), np.int64)
+    for row, camera in enumerate(cameras):
+        share, here = expected.share[row], -camera.w2c[:3, :3].T @ camera.w2c[:3, 3]
+        apparent = (areas / np.maximum(((points - here) ** 2).sum(2), 1e-12)).sum(1)
+        unseen = [cell for cell in np.argsort(apparent) if not share[cell] > 0]
+        for j, of_all in enumerate(shares):
+            budget, drawn = of_all * float(cost[:, -1].sum()), np.ones(len(cost), bool)
+            for cell in unseen:
+                if cost[drawn, 0].sum() <= budget:
+                    break
+                drawn[cell] = False
+            levels = within(cost[drawn], expected.mean[row][drawn], share[drawn], budget)
+            found[row, j, drawn] = levels + 1
+    return found
 
 
 def for_targets(job: Job, pieces: Pieces, cameras: Sequence[Camera], targets: Sequence[float]) -> np.ndarray:
@@ -91,7 +103,7 @@ def for_targets(job: Job, pieces: Pieces, cameras: Sequence[Camera], targets: Se
 
 
 class Levels:
-    """Levels of a ladder, [F, J, L]; a method of `measure`."""
+    """Levels of a ladder, [F, J, L], 0: not drawn; a method of `measure`."""
 
     def __init__(
         self,
@@ -113,7 +125,7 @@ class Levels:
         seen = self._references.at(camera).levels
         assert seen is not None  # the ladder is nested
         for chosen in self._levels[frame].tolist():
-            levels = dict(zip(self._ids, chosen, strict=True))
+            levels = {cell: level for cell, level in zip(self._ids, chosen, strict=True) if level}
             count = sum(self._counts[of_level] for of_level in levels.items())
             yield Shown(seen.render(levels), count, self._pieces.of_composition(levels))
 
