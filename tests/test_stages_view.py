@@ -153,6 +153,21 @@ def test_and_again_when_it_is_out_of_date(tmp_path: Path, bundling: Bundling, ch
         assert bundling.made == 2
 
 
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_run_that_has_not_read_its_photos_is_waited_for(tmp_path: Path, bundling: Bundling, begun: bool):
+    run, events = tmp_path / "run", []
+    if begun:
+        write_files(run, {".lock": b""})
+    with viewing(show(run, events.append, port=0, follow=True)) as port:
+        assert b"Nothing has been trained yet" in ask(port, "/")[2]
+        bundling.live = b'{"live": 1}'
+        write_run(run, chunks=False)
+        wait_for(lambda: ask(port, "/manifest.json")[2] == bundling.live)
+    assert "no run yet" in events[0].text
+    with pytest.raises(RunError, match="no such folder"):
+        show(tmp_path / "none" / "run", print, port=0, follow=True)
+
+
 def test_training_is_followed_to_its_end(tmp_path: Path, bundling: Bundling):
     run, events = write_run(tmp_path / "run", chunks=False), []
     view = show(run, events.append, port=0, follow=True)

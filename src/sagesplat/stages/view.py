@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sagesplat.core.errors import BackendUnavailable, RunError, SageError
-from sagesplat.core.events import Emit, Warned
+from sagesplat.core.events import Emit, Noted, Warned
 from sagesplat.core.extras import install
 from sagesplat.core.names import visible
 from sagesplat.formats.label_edits import FILE
 from sagesplat.io.files import read_json
+from sagesplat.io.lock import FILE as LOCK
 from sagesplat.io.typed import known_json
 from sagesplat.run.records import check_format
 from sagesplat.run.run_dir import RunDir, check_links, how_to_begin
@@ -103,6 +104,10 @@ def _ladder_of(folder: Path | None) -> str:
 
 def _fill(site: "Site", path: Path, emit: Emit, follow: bool) -> Callable[[threading.Event], None] | None:
     """Put what is at `path` into a site; returns what keeps it up to date, if anything does."""
+    if follow and _begins(path):
+        site.note = _NOTHING_YET
+        emit(Noted(f"{path}: no run yet; it is shown once it has read its photos"))
+        return lambda stop: _await(path, emit, site, stop)
     if is_bundle(path):
         if follow:
             raise RunError(f"{path}: a bundle does not change; leave out --follow, or give the run folder")
@@ -114,6 +119,13 @@ def _fill(site: "Site", path: Path, emit: Emit, follow: bool) -> Callable[[threa
         return None
     site.note = _NOTHING_YET
     return lambda stop: _follow(job, site, stop)
+
+
+def _begins(path: Path) -> bool:
+    """Whether a run may be about to begin: its folder is not there yet, or locked before there is a scene."""
+    if not path.exists():
+        return path.absolute().parent.is_dir()
+    return (path / LOCK).exists() and not RunDir(path).scene.exists() and not (path / MANIFEST).exists()
 
 
 def is_bundle(path: Path) -> bool:
@@ -210,6 +222,20 @@ def _is_current(run: RunDir, folder: Path) -> bool:
     made = (folder / MANIFEST).stat().st_mtime
     newer = (path for path in (run.fidelity, run.promises, run.plan) if path.exists())
     return held == chunks and all(path.stat().st_mtime <= made for path in newer)
+
+
+def _await(path: Path, emit: Emit, site: "Site", stop: threading.Event) -> None:
+    """Wait for a run's scene, then follow it."""
+    while not RunDir(path).provenance("scene").exists():  # written after the scene
+        if stop.wait(_EVERY):
+            return
+    try:
+        job = _open_run(path, emit)
+    except SageError as error:
+        site.note = visible(str(error))
+        emit(Warned(str(error)))
+        return
+    _follow(job, site, stop)
 
 
 def _follow(job: "Job", site: "Site", stop: threading.Event) -> None:
