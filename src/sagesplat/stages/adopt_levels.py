@@ -42,6 +42,7 @@ from sagesplat.train.lower_levels import (
     in_cells,
     joined,
     merged_rungs,
+    size_of,
     split_sets,
     trained_sets,
     usable_shares,
@@ -78,7 +79,7 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
         came_in = [(row, _image(job, g, row, space)) for row in rows]
         precision = None if config.lossless else _precision(job, g, came_in)
         del g, space  # of millions of Gaussians; so is what follows
-        ladder, num_lower = _ladder(job, shares, config, checkpoint_key(run, settings, inputs))
+        ladder, num_lower = _ladder(job, shares, config, checkpoint_key(run, settings, inputs), came_in)
         ladder, label_of = in_cells(ladder, cells_wanted(count, config.cells))
         made, replaces = _streams(job, ladder, label_of, precision), ladder.replaces
         del ladder  # what is read back takes as much
@@ -89,12 +90,18 @@ def make_levels(job: Job, config: AdoptConfig) -> None:
     run_stage(job, "nest", settings, inputs, [run.prefixes, run.cells, run.increments], make, swaps=True)
 
 
-def _ladder(job: Job, shares: Sequence[float], config: AdoptConfig, key: str) -> tuple[Assembled, int]:
+def _ladder(
+    job: Job,
+    shares: Sequence[float],
+    config: AdoptConfig,
+    key: str,
+    came_in: Sequence[tuple[int, np.ndarray]],
+) -> tuple[Assembled, int]:
     """All levels, and how many of them are not prefixes of the originals."""
     g, views = job.load_last_level(), spread(job.scene.train_ids.tolist(), _WEIGH)
     weights = importance(g, job.scene, views, "weight", antialiased=job.antialiased)
     order = importance(g, job.scene, views, "sensitivity", antialiased=job.antialiased)
-    ordered = g.select(torch.from_numpy(np.argsort(-order, kind="stable")))
+    ordered = g.select(_best_order(job, g, (order, weights), shares, came_in))
     rungs = merged_rungs(g, weights, shares[:-1])
     del g
     targets = Renders(ordered, job.scene.views, job.backend, job.antialiased, photo_cache(job.memory_limit))
@@ -107,6 +114,25 @@ def _ladder(job: Job, shares: Sequence[float], config: AdoptConfig, key: str) ->
         least = counts_of_first(ordered, share, least)
         levels.append(least)
     return assemble([*sets, Set(ordered, tuple(levels))]), num_lower
+
+
+def _best_order(
+    job: Job,
+    g: Gaussians,
+    importances: Sequence[np.ndarray],
+    shares: Sequence[float],
+    came_in: Sequence[tuple[int, np.ndarray]],
+) -> torch.Tensor:
+    """Rows by the importance whose largest level but the last is closest to what came in.
+
+    Sensitivity is to first order: where many Gaussians overlap none of them is sensitive, and together they
+    leave holes. Where there are many faint ones it is ahead of the blending weight.
+    """
+    orders = [torch.from_numpy(np.argsort(-one, kind="stable")) for one in importances]
+    if len(shares) == 1:
+        return orders[0]
+    most = size_of(shares[-2], len(g))
+    return max(orders, key=lambda rows: _ssim(job, g.select(rows[:most]), dict(came_in)))
 
 
 def _lower_levels(

@@ -21,7 +21,7 @@ _DEFAULT_WEIGHTS = {  # bytes of the default networks', which may not be on this
     DEFAULT_DETECTOR: 689e6,
     DEFAULT_MASK_MODEL: 156e6,
 }
-_ADOPT = 1.4e9, 1450.0  # bytes of adopting a splat: whatever its size, and of each Gaussian
+_ADOPT = 1.4e9, 1050.0  # bytes of adopting a splat: whatever its size, and of each Gaussian
 # CPU seconds, the same, half more than on a fast machine; with --fit renders each training step takes more
 _ADOPT_TIME = 130.0, 330e-6
 _STEP_TIME = 0.25
