@@ -37,7 +37,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.segment.masks import Taxonomy
 from sagesplat.segment.registry import SEGMENTERS
 from sagesplat.segment.segmenters import Segmented
-from sagesplat.stages import pipeline
+from sagesplat.stages import adopt_levels, pipeline
 from sagesplat.stages.adopt import open_splat
 from sagesplat.stages.adopt_levels import make_levels
 from sagesplat.stages.api import open_run
@@ -46,6 +46,7 @@ from sagesplat.stages.export import export_scene
 from sagesplat.stages.label_edits import apply_labels
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.results import increments_of, promises_of, sampled_of, viewpoints_of
+from sagesplat.train.importance import importance
 
 SMALL = AdoptConfig(fit="none", views=14, size=(48, 36), shares=(0.2, 0.4, 0.7, 1.0), kind="object")
 REST = RunConfig(
@@ -102,6 +103,29 @@ def test_levels_end_with_what_came_in(adopted: Path) -> None:
         assert top.counts()[label] == count
         mine, theirs = (np.sort(g.of_labels([label]).means[:, 0].numpy()) for g in (top, before))
         np.testing.assert_allclose(mine, theirs, atol=0.01)  # steps of streams
+
+
+def test_originals_are_ordered_by_what_is_closer_to_what_came_in(adopted: Path) -> None:
+    job = Job(RunDir(adopted), lambda event: None, "cpu")
+    rows, g = job.scene.train_ids.tolist()[:4], random_gaussians(300, degree=0, logit=3.0)
+
+    def image(some: Gaussians, row: int) -> np.ndarray:
+        camera = job.scene.views[row].camera
+        drawn = rasterize(some, camera, backend="cpu", antialiased=job.antialiased)
+        return drawn.rgb.clamp(0, 1).numpy().copy()
+
+    came_in = [(row, image(g, row)) for row in rows]
+
+    def closeness(order: torch.Tensor) -> float:
+        some = g.select(order[:150])
+        return float(np.mean([ssim_map(image(some, row), whole).mean() for row, whole in came_in]))
+
+    by = [importance(g, job.scene, rows, "sensitivity", antialiased=job.antialiased), np.arange(300.0)]
+    good, poor = (closeness(torch.from_numpy(np.argsort(-one, kind="stable"))) for one in by)
+    assert good > poor + 0.01
+    for importances in (by, by[::-1]):
+        found = adopt_levels._best_order(job, g, importances, (0.5, 1.0), came_in)
+        assert closeness(found) == pytest.approx(good, abs=1e-6)
 
 
 def test_fidelity_is_against_what_came_in(adopted: Path) -> None:
