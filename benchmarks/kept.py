@@ -74,12 +74,13 @@ def main(runs: tyro.conf.Positional[tuple[Path, ...]], views: int = 200, write: 
     result = {}
     for run in runs:
         rows = by_condition(Job(RunDir(run, "nested"), lambda event: None), views)
-        result[run.name] = summary(rows) | {"by condition": rows}
+        summed = summary(rows)
+        result[run.name] = summed | {"by condition": rows}
         print(f"{run.name}:")
         for name, row in rows.items():
             low, high = row["interval"]
             print(f"  {name:36} kept {row['kept']:.3f} [{low:.3f}, {high:.3f}] of {row['decisions']}")
-        for name, value in summary(rows).items():
+        for name, value in summed.items():
             print(f"  {name}: {value}")
     finish("kept", result, write)
 

@@ -68,8 +68,8 @@ def within_budgets(job: Job, cameras: Sequence[Camera], shares: Sequence[float])
     points, areas = cells.points(), cells.areas()
     found = np.zeros((len(cameras), len(shares), len(cost)), np.int64)
     for row, camera in enumerate(cameras):
-        share, here = expected.share[row], -camera.w2c[:3, :3].T @ camera.w2c[:3, 3]
-        apparent = (areas / np.maximum(((points - here) ** 2).sum(2), 1e-12)).sum(1)
+        share = expected.share[row]
+        apparent = (areas / np.maximum(((points - camera.position) ** 2).sum(2), 1e-12)).sum(1)
         unseen = [cell for cell in np.argsort(apparent) if not share[cell] > 0]
         for j, of_all in enumerate(shares):
             budget, drawn = of_all * float(cost[:, -1].sum()), np.ones(len(cost), bool)
