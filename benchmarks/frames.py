@@ -28,33 +28,37 @@ from sagesplat.stages.view import show
 from tests.browser import Opened, launch, open_page
 
 LATENCY = 100.0  # ms
-_FRAMES = 30
+_FRAMES, _STEP = 30, 1e-3  # of a camera that moves, and what it moves by in each, in scene extents
 _SOON = 500  # ms after a turn
 _RESTING = """(() => {
   const state = window.sagesplat?.state?.()
   return Boolean(state && state.count && !state.pending && state.status !== "loading")
 })()"""
-# milliseconds from frame to frame while the camera moves a little, as often as wanted
-_MOVE = """async ([pose, frames]) => {
-  const view = window.sagesplat, times = []
-  for (let i = 0; i <= frames; i++) {
-    const [x, y, z] = pose.position
-    view.setPose({ ...pose, position: [x + 1e-4 * (i % 2), y, z] })
-    times.push(await new Promise(requestAnimationFrame))
+# milliseconds a frame while the camera moves, till all that was asked for is drawn
+_MOVE = """async ([pose, step, frames]) => {
+  const view = window.sagesplat, gl = document.querySelector("canvas").getContext("webgl2")
+  const drawn = () => gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4))
+  const [x, y, z] = pose.position
+  drawn()
+  const start = performance.now()
+  for (let i = 1; i <= frames; i++) {
+    view.setPose({ ...pose, position: [x + step * Math.min(i, frames - i), y, z] })
+    await new Promise(requestAnimationFrame)
   }
-  return times.slice(1).map((time, i) => time - times[i])
+  drawn()
+  return (performance.now() - start) / frames
 }"""
 
 
 def frame_times(job: Job, opened: Opened, camera: Camera) -> tuple[float, int]:
-    """Median milliseconds of a frame at a view, and the splats of the cells in sight."""
+    """Milliseconds a frame while the camera moves about a view, and the splats of the cells in sight."""
     opened.page.evaluate("(pose) => window.sagesplat.setPose(pose)", pose_of(camera))
     opened.page.wait_for_timeout(_SOON)
     opened.wait_for(_RESTING)
-    times = opened.page.evaluate(_MOVE, [pose_of(camera), _FRAMES])
+    ms = opened.page.evaluate(_MOVE, [pose_of(camera), _STEP * job.scene.extent, _FRAMES])
     cells = [cell for one in opened.page.evaluate(SAMPLE, pose_of(camera))["labels"] for cell in one["cells"]]
     counts = job.by_cell.counts
-    return float(np.median(times)), sum(counts[cell, level] for cell, level, seen in cells if seen and level)
+    return ms, sum(counts[cell, level] for cell, level, seen in cells if seen and level)
 
 
 def turned(job: Job, opened: Opened, camera: Camera) -> dict[str, float]:

@@ -2,6 +2,7 @@ import { dyno, type PackedSplats, SparkRenderer, SplatMesh } from "@sparkjsdev/s
 import { Group, type Matrix4, Scene, Vector3, type WebGLRenderer } from "three";
 import type { Encoding, Packed } from "../core/pick";
 import type { Box, Format, Handle, Manifest, Renderer, Viewpoint } from "../types";
+import { drawInBatches } from "./batches";
 import { colorsOf } from "./colors";
 import { boundsOf, drawnCells, joinedBounds, touches } from "./culling";
 import { type Answer, Decoders, type PaletteBytes } from "./decoding";
@@ -79,12 +80,14 @@ export class SparkLayer implements Renderer {
       enableLod: false,
       sortRadial: false, // as in training
       accumExtSplats: true, // keeps colours above 1 until blending
-      maxStdDev: 3.33, // where an opaque splat's alpha falls below 1/255
+      minAlpha: 1 / 255, // a contribution below is none, as in training
+      maxStdDev: 3.33, // where an opaque splat's alpha falls below that
       clipXY: 2, // large splats can extend into the image from outside
       maxPixelRadius: 2048,
       preBlurAmount: manifest.antialiased ? 0 : 0.3,
       blurAmount: manifest.antialiased ? 0.3 : 0,
     });
+    drawInBatches(this.spark);
     const cells = manifest.labels.flatMap((label) => label.cells.map((cell) => ({ label: label.id, cell })));
     this.#weights = new Map(cells.map(({ cell }) => [cell.id, cell.levels.map((one) => one.weight)]));
     this.place(rootMatrix(manifest.frame));
