@@ -2,6 +2,7 @@ import type { SparkRenderer } from "@sparkjsdev/spark";
 import { BufferAttribute, InstancedBufferGeometry } from "three";
 
 const BATCH = 64; // splats in an instance
+const MARGIN = 1.3; // half pictures from the centre up to which the projection's slope is taken, as in training
 const CORNERS = [-1, -1, 1, -1, 1, 1, -1, 1];
 
 /** What a splat adds to a pixel: Spark's own shader asks each pixel for what none of our splats has. */
@@ -39,7 +40,11 @@ export function drawInBatches(spark: SparkRenderer): void {
   };
 }
 
-/** Spark's vertex shader, for batches. Throws for a shader of another version. */
+/**
+ * Spark's vertex shader, for batches. As in training, splats outside the picture are stretched no more than at
+ * its rim; one larger than the largest square is cut off, where Spark squeezes it. Throws for a shader of another
+ * version.
+ */
 export function batched(shader: string): string {
   return [
     ["void main() {", "uniform int drawn;\nuniform bool encodeLinear;\n\nvoid main() {"],
@@ -54,8 +59,18 @@ export function batched(shader: string): string {
       "vRgba.a = rgba.a;",
       `vRgba.a = rgba.a;
     if (encodeLinear) vRgba.rgb = srgbToLinear(vRgba.rgb);
-    adjustedStdDev = min(adjustedStdDev, sqrt(2.0 * log(rgba.a / minAlpha)));
-    vSplatUv = position.xy * adjustedStdDev;`,
+    adjustedStdDev = min(adjustedStdDev, sqrt(2.0 * log(rgba.a / minAlpha)));`,
+    ],
+    [
+      "vec2 J2 = -(J1 * viewCenter.xy) * invZ;",
+      `vec2 lens = vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
+        vec2 shift = projectionMatrix[2].xy;
+        vec2 J2 = -J1 * clamp(viewCenter.xy * invZ, -(shift + ${MARGIN}) / lens, (${MARGIN} - shift) / lens);`,
+    ],
+    [
+      "vec2 pixelOffset =",
+      `vSplatUv = position.xy * vec2(scale1, scale2) / sqrt(vec2(eigen1, eigen2));
+    vec2 pixelOffset =`,
     ],
   ].reduce((text, [before = "", after = ""]) => {
     if (text.split(before).length !== 2) throw new Error(`not the shader of Spark 2.2: no ${before}`);

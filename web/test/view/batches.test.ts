@@ -12,6 +12,8 @@ test("splats are read by batch, and fitted once their alpha is known", () => {
   const fitted = shader.indexOf("log(rgba.a / minAlpha)");
   expect(fitted).toBeGreaterThan(shader.indexOf("rgba.a *= blurAdjust"));
   expect(fitted).toBeLessThan(shader.indexOf("float scale1"));
+  expect(shader).toContain("clamp(viewCenter.xy * invZ, -(shift + 1.3) / lens, (1.3 - shift) / lens)");
+  expect(shader.indexOf("vSplatUv = position.xy * vec2(scale1")).toBeGreaterThan(fitted);
 });
 
 test("a shader of another version is refused", () => {
