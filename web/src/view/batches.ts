@@ -3,7 +3,12 @@ import { BufferAttribute, InstancedBufferGeometry } from "three";
 
 const BATCH = 64; // splats in an instance
 const MARGIN = 1.3; // half pictures from the centre up to which the projection's slope is taken, as in training
-const CORNERS = [-1, -1, 1, -1, 1, 1, -1, 1];
+const CORNERS = [
+  [-1, -1],
+  [1, -1],
+  [1, 1],
+  [-1, 1],
+] as const;
 
 /** What a splat adds to a pixel: Spark's own shader asks each pixel for what none of our splats has. */
 const FRAGMENT = `precision highp float;
@@ -81,7 +86,7 @@ export function batched(shader: string): string {
 /** Squares from -1 to 1 on x and y; z is their number in the batch. */
 function quads(): InstancedBufferGeometry {
   const numbers = [...Array(BATCH).keys()];
-  const corners = numbers.flatMap((i) => [0, 2, 4, 6].flatMap((at) => [...CORNERS.slice(at, at + 2), i]));
+  const corners = numbers.flatMap((i) => CORNERS.flatMap(([x, y]) => [x, y, i]));
   const geometry = new InstancedBufferGeometry();
   geometry.setAttribute("position", new BufferAttribute(new Float32Array(corners), 3));
   geometry.setIndex(numbers.flatMap((i) => [0, 1, 2, 0, 2, 3].map((corner) => 4 * i + corner)));
