@@ -45,6 +45,7 @@ from sagesplat.adapt.viewpoint import (
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer.frames import FLIP, camera_at
 from sagesplat.viewer.manifest import placed
+from sagesplat.viewer.numbers import packed, unpacked
 from sagesplat.viewer.promises import Seen, fidelity_document, ssim_document
 from sagesplat.viewer.sent_model import read_fidelity, read_model
 
@@ -250,8 +251,8 @@ def _ssim_case(name: str, made: ViewModel, seed: int, stored: Mapping[str, Case]
     rng = np.random.default_rng(seed)
     n = made.num_views
     seen = Seen(rng.uniform(0, 0.3, n), np.full(n, np.nan), rng.normal(0, 0.2, n))
-    document = ssim_document({made.label_id: made}, cameras_at(made), {made.label_id: seen})
-    sent = read_model(stored.get(name, document), made.label_id)
+    document = packed(ssim_document({made.label_id: made}, cameras_at(made), {made.label_id: seen}))
+    sent = read_model(unpacked(stored.get(name, document)), made.label_id)
     position, direction = rng.normal(0, 3, (6, 3)), rng.normal(size=(6, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     for i in (0, 2, 3):  # a known view, and viewpoints beside it: the support is large enough
@@ -299,9 +300,9 @@ def fidelity_case(
     cells, cameras = make_cells(seed, labels, 2.5), drawn_cameras(seed, views)
     models = fidelity_models(cells, cameras, levels, seed, last)
     files = {c: list(range(1 + (c % 5 == 4 and levels > 1), levels + 1)) for c in cells.ids.tolist()}
-    document = fidelity_document(models, files, levels, cameras)
+    document = packed(fidelity_document(models, files, levels, cameras))
     there = [*cameras[:3], *drawn_cameras(seed + 1, 4), posed((900.0, 0, 0), AHEAD)]
-    sent = read_fidelity(stored.get(name, document))
+    sent = read_fidelity(unpacked(stored.get(name, document)))
     expected = expect(sent, cells, there, max(map(len, files.values())))
     rng = np.random.default_rng(seed)
     composed = 1 + (

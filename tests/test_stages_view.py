@@ -79,7 +79,7 @@ class Bundling(types.ModuleType):
     def bundle(self, job, out: Path) -> None:
         self.made += 1
         levels = [
-            {"sha256": c["sha256"][:16]}
+            {"uri": f"chunks/{c['uri']}"}
             for c in json.loads((job.run.increments / "index.json").read_text())["chunks"]
         ]
         manifest = {
@@ -121,7 +121,7 @@ def bundling(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Bundling:
 def write_run(folder: Path, chunks: bool = True) -> Path:
     contents = {"scene.json": b"{}", "provenance/scene.json": json.dumps({"format": FORMAT}).encode()}
     if chunks:
-        contents["nested/increments/index.json"] = b'{"chunks": [{"sha256": "aa"}, {"sha256": "bb"}]}'
+        contents["nested/increments/index.json"] = b'{"chunks": [{"uri": "aa"}, {"uri": "bb"}]}'
         contents["nested/promises.json"] = contents["nested/fidelity.json"] = b"{}"
     return write_files(folder, contents)
 
@@ -140,7 +140,7 @@ def test_and_again_when_it_is_out_of_date(tmp_path: Path, bundling: Bundling, ch
     with show(run, print, port=0):
         pass
     if change == "chunks":
-        (run / "nested/increments/index.json").write_text('{"chunks": [{"sha256": "aa"}]}')
+        (run / "nested/increments/index.json").write_text('{"chunks": [{"uri": "aa"}]}')
     elif change == "plan":
         for path in run.rglob("*"):
             os.utime(path, (0, 0))

@@ -33,7 +33,7 @@ from sagesplat.adapt.cells import POINTS, Cells, describe_cells
 from sagesplat.adapt.viewpoint import NO_CALIBRATION, Calibration, ViewModel
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.core.second_opacity import SecondOpacities
-from sagesplat.formats.increments import DIGITS, ranges_of, totals, write_increments
+from sagesplat.formats.increments import DIGITS, totals, write_increments
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.spz import read_spz
 from sagesplat.formats.stream_header import AS_GIVEN
@@ -45,6 +45,7 @@ from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_docum
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
 from sagesplat.viewer.pack import Ladder, costs_of, gains_of, order_of
+from sagesplat.viewer.numbers import packed, unpacked
 from sagesplat.viewer.promises import Seen, allowed_change, fidelity_document, of_cells, ssim_document
 from sagesplat.viewer.quality import (
     curve_entry,
@@ -77,10 +78,12 @@ def test_shared_vectors_are_what_is_computed() -> None:
     )
     # positions are sent as integers: one that lies between two is rounded as the processor's last digit
     # has it, so predictions are compared from the stored documents
-    documents = {case["name"]: case["promises"] for case in promised}
+    documents = {case["name"]: case["promises"] for case in promised}  # packed
     for stored, cases in ((distances, distance_cases()), (promised, promise_cases(documents))):
         for old, new in zip(stored, cases, strict=True):
             assert old["name"] == new["name"]
+            for case in (old, new) if "promises" in old else ():
+                case["promises"] = unpacked(case["promises"])
             for a, b in zip(_numbers(old), _numbers(json.loads(json.dumps(new))), strict=True):
                 assert a == pytest.approx(b, rel=1e-6, abs=1 if abs(a) > 100 else 1e-6)
 
@@ -157,7 +160,11 @@ def assert_close_means(read: SentModel, made: ViewModel, *at: np.ndarray) -> Non
 def sent(made: ViewModel, seen: Seen | None = None) -> dict[str, Any]:
     """The document of a model, as it is read."""
     known = {} if seen is None else {made.label_id: seen}
-    return json.loads(json.dumps(ssim_document({made.label_id: made}, cameras_at(made), known)))
+    return passed_on(ssim_document({made.label_id: made}, cameras_at(made), known))
+
+
+def passed_on(document: dict[str, Any]) -> dict[str, Any]:
+    return unpacked(json.loads(json.dumps(packed(document))))
 
 
 @pytest.mark.parametrize(("seed", "views"), [(2, 1), (3, 12), (5, 40)])
@@ -226,7 +233,7 @@ def test_compositions_are_promised_no_more_than_before_they_were_sent(labels, vi
     cells, drawn = make_cells(seed, labels, 2.5), drawn_cameras(seed, views)
     models = fidelity_models(cells, drawn, 5, seed)
     files = {cell: [1, 2, 3, 4, 5] for cell in cells.ids.tolist()}
-    document = json.loads(json.dumps(fidelity_document(models, files, 5, drawn)))
+    document = passed_on(fidelity_document(models, files, 5, drawn))
     shorter = [2 * np.degrees(np.arctan(min(one.width, one.height) / 2 / one.focal)) for one in drawn]
     assert document["fov"] == round(max(shorter))
     read = read_fidelity(document)
@@ -340,15 +347,33 @@ def manifest_of(folder: Path) -> dict[str, Any]:
     Draft202012Validator(schema).validate(manifest)
     promises = Draft202012Validator({"$ref": "#/$defs/promises", "$defs": schema["$defs"]})
     for reference in manifest["promises"].values():
-        promises.validate(json.loads((folder / reference["uri"]).read_text()))
+        promises.validate(unpacked(json.loads((folder / reference["uri"]).read_text())))
     return manifest
+
+
+def levels_in(cell: dict[str, Any]) -> list[dict[str, Any]]:
+    """The levels of a cell in a manifest, one by one."""
+    return [
+        {
+            "uri": some["uri"],
+            "format": some["format"],
+            "offset": some.get("offset", 0) + sum(some["bytes"][:i]),
+            "bytes": nbytes,
+            "count": some["counts"][i],
+            "sha256": some["sha256"][i * (n := len(some["sha256"]) // len(some["bytes"])) : (i + 1) * n],
+            "refine": None if i else some.get("refine"),
+            "weight": some["weights"][i] if "weights" in some else None,
+        }
+        for some in cell["levels"]
+        for i, nbytes in enumerate(some["bytes"])
+    ]
 
 
 def test_a_category_with_fewer_files_than_others_has_as_many_levels(tmp_path, contents, viewer) -> None:
     def levels_of(made: Contents) -> list[int]:
         write_bundle(tmp_path / "out", made, viewer)
         (car,) = (one for one in manifest_of(tmp_path / "out")["labels"] if one["name"] == "car")
-        most = max(len(cell["levels"]) for cell in car["cells"])
+        most = max(len(levels_in(cell)) for cell in car["cells"])
         levels = car["quality"]["fidelity"]["levels"]
         assert levels == list(range(1, most + 1))
         assert len(car["quality"]["fidelity"]["mean"]) == most
@@ -368,7 +393,7 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
     assert [label["id"] for label in manifest["labels"]] == [-1, 3, 184]
     cells = [cell for label in manifest["labels"] for cell in label["cells"]]
     assert [cell["id"] for cell in cells] == [0, 1, 2, 3]
-    assert [[level["count"] for level in cell["levels"]] for cell in cells] == [
+    assert [[level["count"] for level in levels_in(cell)] for cell in cells] == [
         [4, 6], [3, 3, 6], [2, 3, 3], [5, 4],
     ]  # fmt: skip
     total = 0
@@ -380,7 +405,7 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
         there = bounds[:3] + points[:, :3] / 255 * (bounds[3:] - bounds[:3])
         known = contents.cells.points()[cell["id"], : len(there)] * FLIP
         np.testing.assert_allclose(there, known, atol=1e-4)
-        for level in cell["levels"]:
+        for level in levels_in(cell):
             content = (out / level["uri"]).read_bytes()
             assert len(content) == level["bytes"]
             assert hashlib.sha256(content).hexdigest()[:DIGITS] == level["sha256"]
@@ -389,7 +414,7 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
     assert manifest["totals"]["bytes"] == written.chunks == total
     assert manifest["totals"]["count"] == 39
     order = packed_parts(out)
-    listed = [[cell["id"], k + 1] for cell in cells for k in range(len(cell["levels"]))]
+    listed = [[cell["id"], k + 1] for cell in cells for k in range(len(levels_in(cell)))]
     assert [one for one in listed if one in order] == sorted(order)
     assert sorted(order[:4]) == [[cell, 1] for cell in range(4)]  # the smallest of everything
     assert written.manifest == (out / "manifest.json").stat().st_size
@@ -407,13 +432,13 @@ def test_a_bundle_holds_what_its_manifest_says(tmp_path, contents, viewer) -> No
 
 
 def test_promises_know_the_model_s_views_and_shares(contents) -> None:
-    promises, made = json.loads(documents(contents)[1]["ssim"]), contents.categories[1].ssim
+    promises, made = unpacked(json.loads(documents(contents)[1]["ssim"])), contents.categories[1].ssim
     (entry,) = promises["labels"]
     (whole,) = entry["cells"]
-    views = np.cumsum(promises["views"], 1).T / 1e4
+    views = np.array(promises["views"]).T / 1e4
     assert (promises["focal"], promises["screens"]) == (made.focal, list(made.screens))
     assert len(views) == made.num_views  # the test photo taught nothing
-    assert np.cumsum(whole["shares"]).tolist() == [2500] * len(views)
+    assert whole["shares"] == [2500] * len(views)
     inputs = read_model(promises, 3).inputs[:, :-1].round(3)
     wanted = sorted(map(tuple, made.inputs[:, :-1].round(3).tolist()))
     np.testing.assert_allclose(sorted(map(tuple, inputs.tolist())), wanted, atol=2e-3)
@@ -434,11 +459,13 @@ def packed_parts(out: Path) -> list[list[int]]:
     manifest = manifest_of(out)
     pack, at = manifest["pack"], 0
     content = (out / pack["uri"]).read_bytes()
-    levels = {cell["id"]: cell["levels"] for label in manifest["labels"] for cell in label["cells"]}
+    levels = {cell["id"]: levels_in(cell) for label in manifest["labels"] for cell in label["cells"]}
     for cell, level in pack["order"]:
         entry = levels[cell][level - 1]
         part = content[at : at + entry["bytes"]]
-        assert hashlib.sha256(part).hexdigest()[:DIGITS] == entry["sha256"]
+        file, begin = (out / entry["uri"]).read_bytes(), entry["offset"]
+        assert part == file[begin : begin + entry["bytes"]]
+        assert hashlib.sha256(part).hexdigest().startswith(entry["sha256"])
         at += len(part)
     assert at == len(content) == pack["bytes"]
     assert pack["sha256"] == hashlib.sha256(content).hexdigest()
@@ -453,7 +480,7 @@ def test_the_page_names_the_pack(tmp_path, contents, viewer) -> None:
         write_bundle(out, contents, viewer)
         pack = json.loads((out / "manifest.json").read_text())["pack"]
         levels = {c["id"]: c["levels"] for label in manifest_of(out)["labels"] for c in label["cells"]}
-        first = sum(levels[cell][0]["bytes"] for cell, level in pack["order"] if level == 1)
+        first = sum(levels[cell][0]["bytes"][0] for cell, level in pack["order"] if level == 1)
         page = (out / "index.html").read_text()
         assert page == f'<head><meta name="pack" content="{pack["uri"]} {first}" /></head>'
         assert has_viewer(out, viewer)
@@ -470,7 +497,7 @@ def test_levels_that_replace_are_in_the_manifest(tmp_path, contents, viewer) -> 
     cells = [cell for label in manifest["labels"] for cell in label["cells"]]
     assert [level.get("refine") for level in cells[1]["levels"]] == [None, None, "REPLACE"]
     assert [level["format"] for level in cells[1]["levels"]] == ["spz", "spz", "ply"]
-    others = [level for cell in cells if cell["id"] != 1 for level in cell["levels"]]
+    others = [some for cell in cells if cell["id"] != 1 for some in cell["levels"]]
     assert {"refine"} & {key for level in others for key in level} == set()
     assert manifest["totals"]["count"] == 39 - 6  # of the full scene
     assert written.chunks == sum(chunk.nbytes for chunk in chunks) > manifest["totals"]["bytes"]
@@ -483,13 +510,10 @@ def test_coded_streams_are_ranges_in_manifest_and_pack(tmp_path, contents, viewe
     made = write_streams(tmp_path / "chunks", g, SIZES, NAMES, label_of=LABEL_OF, second=second)
     written = write_bundle(tmp_path / "out", replace(contents, chunks=made.increments), viewer)
     manifest = manifest_of(tmp_path / "out")
-    listed = [level for label in manifest["labels"] for cell in label["cells"] for level in cell["levels"]]
     cells = [cell for label in manifest["labels"] for cell in label["cells"]]
-    sent = [[(one["uri"], one.get("offset"), one["bytes"]) for one in cell["levels"]] for cell in cells]
-    ranges = [offset for some in sent for _, offset, _ in ranges_of(some)]
-    assert ranges == [one.offset for one in made.increments]
-    assert all(["offset" in one for one in cell["levels"]].index(False) == 1 for cell in cells)
-    assert sum("offset" in one for one in listed) == len(cells)
+    listed = [level for cell in cells for level in levels_in(cell)]
+    assert [one["offset"] for one in listed] == [one.offset for one in made.increments]
+    assert [len(cell["levels"]) for cell in cells] == [1] * len(cells)
     assert [level["weight"] for level in listed] == [round(one.weight or 0, 6) for one in made.increments]
     assert {level["format"] for level in listed} == {"stream"}
     assert len(list((tmp_path / "out" / "chunks").iterdir())) == 3
@@ -519,10 +543,10 @@ def test_a_palette_is_the_first_range_of_its_file(tmp_path, contents, viewer) ->
         assert sum(palettes) <= (sent - first)[:, column].sum() < sum(palettes) + len(counts)
     assert 0 <= sent[:, -1].sum() - manifest["totals"]["bytes"] < len(counts)
     for label in manifest["labels"]:
-        palette, levels = label["palette"], [one for cell in label["cells"] for one in cell["levels"]]
+        palette, levels = label["palette"], [one for cell in label["cells"] for one in levels_in(cell)]
         content = (tmp_path / "out" / palette["uri"]).read_bytes()
         assert {one["uri"] for one in levels} == {palette["uri"]}
-        begin = min(one["offset"] for one in levels if "offset" in one)
+        begin = min(one["offset"] for one in levels)
         assert (palette["offset"], palette["bytes"]) == (0, begin)
         assert hashlib.sha256(content[: palette["bytes"]]).hexdigest()[:DIGITS] == palette["sha256"]
         assert palette["bytes"] + sum(one["bytes"] for one in levels) == len(content)
@@ -597,7 +621,7 @@ def test_without_points_or_labels() -> None:
     assert promises == manifest["promises"] == {}
     assert manifest["pack"] is None
     assert manifest["labels"] == []
-    assert manifest["totals"] == {"count": 0, "bytes": 0, "gpuBytes": 0}
+    assert manifest["totals"] == {"count": 0, "bytes": 0}
     assert np.isfinite(manifest["start"]["target"]).all()
 
 

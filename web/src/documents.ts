@@ -50,8 +50,9 @@ export interface Manifest {
   totals: {
     count: Whole;
     bytes: Whole;
-    gpuBytes: Whole;
   };
+  /** Of a Gaussian in the memory of a graphics card. */
+  gpuBytes: number;
   ladder?: Sha256;
   /** What fidelities look like: a picture with the same part of a view for each, side by side, equally wide; 1 is the full scene. */
   looks?: {
@@ -124,22 +125,22 @@ export interface Cell {
   area: number;
   /** By how far Gaussians lie around their point, world units. */
   radius: number;
-  levels: Level[];
+  levels: Levels[];
 }
-/** The increment that a level adds to the level below, or replaces it by. `sha256` is of its bytes: of the file, or of the range. */
-export interface Level {
+/** The increments that consecutive levels of a cell add to the level below: a level that is a file, or those of a coded stream, which are ranges that touch. */
+export interface Levels {
   uri: Path;
   format: Format;
-  /** Of a range: its first byte in the file. The first of a cell and those that replace have it; the others follow the one below. All of a label fill the file. */
-  offset?: number;
-  /** Weight of the second opacities of all Gaussians of the cell where this is its newest level. Without it each has one opacity. */
-  weight?: number;
-  /** The level shows none of the increments below it. Without this it adds to them. */
+  /** The first of these levels shows none of the increments below it. Without this it adds to them. */
   refine?: "REPLACE";
-  bytes: number;
-  gpuBytes: number;
-  count: number;
-  sha256: Digits;
+  offset?: Whole;
+  /** A text of the first digits of each level's SHA-256 in hexadecimal, equally many. */
+  sha256: string;
+  /** By level, weight of the second opacities of all Gaussians of the cell where it is the newest. Without them each has one opacity. */
+  weights?: number[];
+  bytes: number[];
+  /** Gaussians. */
+  counts: number[];
 }
 /** Quality by level whatever the viewpoint, until the viewpoint models are there. */
 export interface LabelQuality {
@@ -179,7 +180,7 @@ export interface Camera {
   /** fx fy cx cy, pixels. */
   intrinsics: [number, number, number, number];
 }
-/** promises-*.json: the viewpoint models of all labels for one quality. Lists over views hold differences to the view before. */
+/** promises-*.json: the viewpoint models of all labels for one quality. Its lists of steps and rows are written as their lengths, and their numbers in `numbers` (docs/formats.md). */
 export interface Promises {
   quality: Quality;
   extent: number;
@@ -221,22 +222,17 @@ export interface CellPromises {
   levels?: number[];
   /** For an unknown distance. */
   medianLogDistance: number;
-  /** By level. */
-  offsets: number[];
-  /** Rows of the shared views: differences. None: the mean is the offsets. */
-  views: Whole[];
-  /** By own view: differences. */
-  logDistances: {
-    unit: Unit;
-    steps: Steps;
-  };
+  offsets: Steps;
+  /** Of the shared views that the model is fitted on. None: the mean is the offsets. */
+  rows: Whole[];
+  logUnit: Unit;
+  logDistances: Steps;
   /** Of a cell: by cosine over the ladder and own view, in 3/100 of what is missing at a level. */
   terms?: Steps[];
-  /** Of a label as a whole: by level and own view, differences along both. */
-  values?: {
-    units: Unit[];
-    steps: Steps[];
-  };
+  /** Of a label as a whole: of its values, by level. */
+  units?: Unit[];
+  /** Of a label as a whole: by level and own view, differences to the level below. */
+  values?: Steps[];
   factors?: Steps;
   /** By level; none: 0. Of a label as a whole. */
   curves?: Curve[];

@@ -9,11 +9,33 @@ export const QUALITIES: readonly Quality[] = ["fidelity", "ssim"];
 /** A type of plain data whose fields and items do not change. */
 type Immutable<T> = { readonly [K in keyof T]: Immutable<T[K]> };
 
-export type Manifest = Immutable<documents.Manifest>;
-export type Label = Immutable<documents.Label>;
-export type Cell = Immutable<documents.Cell>;
+/** The manifest as `parseManifest` returns it. */
+export type Manifest = Omit<Immutable<documents.Manifest>, "labels" | "promises" | "totals"> & {
+  readonly labels: readonly Label[];
+  readonly promises: { readonly [quality in Quality]?: Keyed<documents.Reference> };
+  readonly totals: Readonly<Record<"count" | "bytes" | "gpuBytes", number>>;
+};
+export type Label = Omit<Immutable<documents.Label>, "cells" | "palette"> & {
+  readonly cells: readonly Cell[];
+  readonly palette?: Keyed<documents.Palette>;
+};
+export type Cell = Omit<Immutable<documents.Cell>, "levels"> & { readonly levels: readonly Level[] };
+/** A file or range with a name that no other has. */
+type Keyed<T> = Immutable<T> & { readonly key: string };
+/** The increment that a level adds to the level below, or replaces it by. */
+export interface Level {
+  readonly uri: string;
+  readonly format: Format;
+  readonly offset?: number; // of a range
+  readonly bytes: number;
+  readonly gpuBytes: number;
+  readonly count: number; // Gaussians
+  readonly key: string;
+  readonly sha256: string; // its first digits
+  readonly refine?: "REPLACE";
+  readonly weight?: number; // of second opacities
+}
 export type LabelQuality = Immutable<documents.LabelQuality>;
-export type Level = Immutable<documents.Level>;
 export type Camera = Immutable<documents.Camera>;
 export type Pack = Immutable<documents.Pack>;
 export type Promises = Immutable<documents.Promises>;
@@ -77,7 +99,7 @@ export interface Renderer {
     bytes: Uint8Array,
     format: Format,
     below?: readonly Uint8Array[],
-    palette?: { readonly sha256: string; readonly bytes: Uint8Array },
+    palette?: { readonly key: string; readonly bytes: Uint8Array },
   ): Promise<Handle>;
   /** Shows some increments and hides others in one tick; hidden ones stay drawn until the next sort is done. */
   swap(show: readonly Handle[], hide: readonly Handle[]): void;

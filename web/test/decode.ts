@@ -14,7 +14,7 @@ interface Stream {
 function streamsOf(file: Uint8Array, name: number): Stream[] {
   const found: Stream[] = [];
   let at = endOfPalette(file);
-  const palette = at ? { sha256: String(name), bytes: file.slice(0, at) } : undefined;
+  const palette = at ? { key: String(name), bytes: file.slice(0, at) } : undefined;
   const number = () => {
     let value = 0;
     for (let shift = 0; ; shift += 7) {

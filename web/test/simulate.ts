@@ -331,7 +331,7 @@ export class FakeRenderer implements Renderer {
     const begin = this.begins.findLast((first) => first <= level) ?? 1;
     if (below.length !== (format === "stream" ? level - begin : 0)) throw new Error("without what is below");
     const needed = level >= (this.begins.at(-1) ?? 1) ? this.palettes[label] : undefined;
-    if (palette?.sha256 !== needed || (palette && fnv(palette.bytes) !== needed)) {
+    if (palette?.key !== needed || (palette && fnv(palette.bytes) !== needed)) {
       throw new Error("not with its palette");
     }
     const handle: Handle = { label, cell, level, count: bytes.length };

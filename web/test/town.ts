@@ -5,7 +5,6 @@ import type { Cell, Label, Level, Manifest, Promises, Viewpoint } from "../src/t
 import { type Network, seeded } from "./simulate";
 import {
   cellOf,
-  differences,
   FOCAL,
   frustumOf,
   lensOf,
@@ -79,8 +78,10 @@ function part(
     const content = new Uint8Array(Math.max(8, Math.round(size)));
     new DataView(content.buffer).setUint32(0, 64 * id + k); // no two files are the same
     const count = Math.max(1, Math.round(size / 20));
+    const uri = `chunks/p${id}-${k + 1}.spz`;
     return {
-      ...store(network, `chunks/p${id}-${k + 1}.spz`, content),
+      ...store(network, uri, content),
+      key: uri,
       format: "spz",
       gpuBytes: 56 * count,
       count,
@@ -101,7 +102,7 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
   });
   const extent = SIDE * side;
   const column = (axis: number) =>
-    differences(all.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? extent : 1)));
+    all.map((view) => Math.round((1e4 * (view[axis] ?? 0)) / (axis < 3 ? extent : 1)));
   return {
     quality: "fidelity",
     extent,
@@ -118,11 +119,8 @@ function promisesOf(labels: readonly Label[], side: number, views: number, rando
         return {
           ...modelOf(id, label.quality.fidelity?.mean ?? [], rows, random),
           medianLogDistance: 2,
-          logDistances: {
-            unit: 0.01,
-            steps: differences(rows.map((row) => 100 * Math.log(1 + (away[row] ?? 0)))),
-          },
-          factors: differences(all.map(() => 20 * random())),
+          logDistances: rows.map((row) => Math.round(100 * Math.log(1 + (away[row] ?? 0)))),
+          factors: all.map(() => Math.round(20 * random())),
         };
       });
       return { ...modelsOf(label, models), lengths: [0.2, 0.7, 0.8, 0.6] as const };

@@ -6,7 +6,7 @@ import { loadManifest } from "../src/core/manifest";
 import { Streamer } from "../src/core/streamer";
 import type { Level, Manifest, Quat, Settings, Vec3, Viewpoint } from "../src/types";
 import { FakeRenderer, Network, putIncrements, rangeOf, seeded, VirtualClock } from "./simulate";
-import { BASE, frustumOf, lensOf, NO_BUDGET } from "./worlds";
+import { BASE, documentOf, frustumOf, lensOf, NO_BUDGET } from "./worlds";
 
 /** A file of a bundle, as a server has it. */
 export interface Served {
@@ -183,7 +183,7 @@ function serve(network: Network, manifest: Manifest, files: readonly Served[]): 
   for (const { uri, wire, text } of files) {
     network.files.set(uri, text === undefined ? new Uint8Array(wire) : new TextEncoder().encode(text));
   }
-  network.files.set("manifest.json", new TextEncoder().encode(JSON.stringify(manifest)));
+  network.files.set("manifest.json", new TextEncoder().encode(JSON.stringify(documentOf(manifest))));
   putIncrements(network, manifest);
 }
 

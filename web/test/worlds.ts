@@ -1,6 +1,7 @@
 /** Small bundles made up for tests. */
 
 import { rotate } from "../src/core/distance";
+import type * as documents from "../src/documents";
 import type {
   Cell,
   CellPromises,
@@ -22,6 +23,7 @@ import { fnv, type Network, seeded } from "./simulate";
 export const BASE = new URL("https://example.org/");
 export const PROMISES = "promises-1.json";
 export const FOCAL = 800; // px, of the photos
+const GPU_BYTES = 56; // of a Gaussian
 export const NO_BUDGET = { bytes: Infinity, gpuBytes: Infinity, count: Infinity };
 export const DEFAULTS: Settings = {
   mode: "target",
@@ -136,6 +138,7 @@ export const manifestOf = (
   antialiased: false,
   background: [0, 0, 0],
   totals: totals(labels),
+  gpuBytes: GPU_BYTES,
   labels,
   promises: promises ? { fidelity: promises } : {},
   target: { quality: "fidelity", value: 0.8 },
@@ -144,6 +147,47 @@ export const manifestOf = (
   start: { position: [0, 0, 0], quaternion: [0, 0, 0, 1], target: [0, 0, -1] },
   licenses: [],
 });
+
+/** A manifest as JSON has it: levels of a stream together, and no keys. */
+export function documentOf({ totals, labels, promises, ...manifest }: Manifest): documents.Manifest {
+  const plain = <T extends { readonly key: string }>({ key: _, ...file }: T) => file;
+  const { fidelity, ssim } = promises;
+  return JSON.parse(
+    JSON.stringify({
+      ...manifest,
+      totals: { count: totals.count, bytes: totals.bytes },
+      labels: labels.map(({ palette, cells, ...label }) => ({
+        ...label,
+        palette: palette && plain(palette),
+        cells: cells.map((cell) => ({ ...cell, levels: together(cell.levels) })),
+      })),
+      promises: { fidelity: fidelity && plain(fidelity), ssim: ssim && plain(ssim) },
+    }),
+  );
+}
+
+function together(levels: readonly Level[]): documents.Levels[] {
+  const runs: Level[][] = [];
+  for (const level of levels) {
+    const run = runs.at(-1);
+    if (run && level.format === "stream" && level.uri === run[0]?.uri && !level.refine) run.push(level);
+    else runs.push([level]);
+  }
+  return runs.map((run) => {
+    const { uri, format, offset, refine } = run[0] as Level;
+    const weights = run.flatMap(({ weight }) => weight ?? []);
+    const lists = { bytes: run.map(({ bytes }) => bytes), counts: run.map(({ count }) => count) };
+    return {
+      uri,
+      format,
+      ...(offset !== undefined && { offset }),
+      ...(refine && { refine }),
+      ...(weights.length && { weights }),
+      ...lists,
+      sha256: run.map(({ sha256 }) => sha256).join(""),
+    };
+  });
+}
 
 /** Puts the files of cells one after the other into one. */
 function streamOf(
@@ -156,10 +200,11 @@ function streamOf(
   let end = palette;
   const levels = cells.map((files) =>
     files.map((file) => {
-      content.set(network.files.get(file.uri) ?? [], end);
+      const offset = end;
+      content.set(network.files.get(file.uri) ?? [], offset);
       network.files.delete(file.uri);
       end += file.bytes;
-      return { ...file, uri, format: "stream" as const, offset: end - file.bytes };
+      return { ...file, uri, format: "stream" as const, offset, key: `${uri}:${offset}` };
     }),
   );
   network.files.set(uri, content);
@@ -169,7 +214,8 @@ function streamOf(
 /** The first bytes of a file. */
 function paletteIn(network: Network, uri: string, bytes: number) {
   const content = network.files.get(uri)?.subarray(0, bytes) ?? new Uint8Array(0);
-  return { uri, offset: 0 as const, bytes, sha256: fnv(content) };
+  const sha256 = fnv(content);
+  return { uri, offset: 0 as const, bytes, sha256, key: sha256 };
 }
 
 /** All increments, level by level. */
@@ -189,13 +235,14 @@ export function packOf(network: Network, labels: readonly Label[]): Pack {
 
 export function store(network: Network, uri: string, content: Uint8Array) {
   network.files.set(uri, content);
-  return { uri, bytes: content.length, sha256: fnv(content) };
+  const sha256 = fnv(content);
+  return { uri, bytes: content.length, sha256, key: sha256 };
 }
 
 function put(network: Network, uri: string, size: number, random: () => number): Level {
   const content = Uint8Array.from({ length: size }, () => Math.floor(256 * random()));
   const count = Math.max(1, Math.round(size / 20));
-  return { ...store(network, uri, content), format: "spz", gpuBytes: 56 * count, count };
+  return { ...store(network, uri, content), key: uri, format: "spz", gpuBytes: GPU_BYTES * count, count };
 }
 
 function labelOf(id: number, cells: readonly (readonly Level[])[], random: () => number): Label {
@@ -237,10 +284,6 @@ export const qualityOf = (means: readonly number[]): LabelQuality => ({
   bound: means.map((mean) => mean - 0.03),
 });
 
-/** Differences of whole numbers along a list, as promises hold them. */
-export const differences = (values: readonly number[]): number[] =>
-  values.map((value, i) => Math.round(value) - Math.round(values[i - 1] ?? 0));
-
 /** A label's models, with the means of the label by level, that vary a little from view to view. */
 export function modelsOf(label: Label, models: readonly CellPromises[]): LabelPromises {
   return {
@@ -267,9 +310,10 @@ export function modelOf(
     id,
     ladder: means.map((_, k) => k + 1),
     medianLogDistance: 1.6,
-    offsets: means,
-    views: differences(rows),
-    logDistances: { unit: 0.01, steps: differences(rows.map(() => 150 + 30 * random())) },
+    offsets: means.map((mean) => Math.round(1e4 * mean)),
+    rows,
+    logUnit: 0.01,
+    logDistances: rows.map(() => Math.round(150 + 30 * random())),
     terms: means.map(() => rows.map(() => Math.round(2 * (random() - 0.5)))),
   };
 }
@@ -289,7 +333,7 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
   ]);
   const rows = views.map((_, i) => i);
   const column = (axis: number) =>
-    differences(views.map((view) => (1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1)));
+    views.map((view) => Math.round((1e4 * (view[axis] ?? 0)) / (axis < 3 ? 5 : 1)));
   return {
     quality: "fidelity",
     extent: 5,
@@ -304,7 +348,7 @@ function promisesOf(labels: readonly Label[], random: () => number): Promises {
         label,
         label.cells.map(({ id }) => ({
           ...modelOf(id, label.quality.fidelity?.mean ?? [], rows, random),
-          factors: differences(rows.map(() => 10 + 20 * random())),
+          factors: rows.map(() => Math.round(10 + 20 * random())),
         })),
       ),
     ),

@@ -34,9 +34,10 @@ FileFormat = Literal["spz", "ply"]  # of a file that is one increment
 Format = Literal["stream", "spz", "ply"]
 Refine = Literal["ADD", "REPLACE"]
 INDEX = "index.json"
-# of hashes in a manifest: 48 bits find damage, and tell a scene's increments apart (in one of five million
-# scenes of 10,000 two are alike); all digits were half of the manifest
+# of hashes in a manifest, whose longest part they are: 48 bits of a file; 16 of a range, as a damaged stream
+# hardly ever ends in the coder's first state, but for bits that are not modelled
 DIGITS = 12
+DIGITS_OF_RANGE = 4
 STREAM = ".sgst"
 _FORMATS: dict[str, Format] = {STREAM: "stream", ".ply": "ply"}  # by suffix; all others are SPZ
 _FINE_BITS = 8, 8  # of SH coefficients
@@ -251,16 +252,16 @@ def full_scene(listed: Sequence[Increment]) -> list[Increment]:
     return [one for one in listed if one.level >= newest.get(one.cell, 0)]
 
 
-def ranges_of(levels: Iterable[tuple[str, int | None, int]]) -> list[tuple[str, int, int]]:
-    """File, first byte and bytes of a cell's levels in a manifest.
+def ranges_of(files: Iterable[tuple[str, int, Sequence[int]]]) -> list[tuple[str, int, int]]:
+    """File, first byte and bytes of each of a cell's levels in a manifest.
 
-    A part of a stream that does not say where it begins follows the one below; others are files.
+    `files`: of consecutive levels that touch, their file, its first byte of them, and the bytes of each.
     """
-    found: list[tuple[str, int, int]] = []
-    for uri, offset, nbytes in levels:
-        follows = sum(found[-1][1:]) if found and uri.endswith(STREAM) else 0
-        found.append((uri, follows if offset is None else offset, nbytes))
-    return found
+    return [
+        (uri, offset + sum(sizes[:i]), nbytes)
+        for uri, offset, sizes in files
+        for i, nbytes in enumerate(sizes)
+    ]
 
 
 def totals(listed: Sequence[Increment], cells: Sequence[int], levels: int, what: str) -> np.ndarray:

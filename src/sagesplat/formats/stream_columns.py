@@ -161,7 +161,7 @@ def _code_lengths(coder: Coder, name: str, zero: np.ndarray, given: np.ndarray |
     """Numbers from 0 on: how many bits they have, then those below the highest."""
     lengths = None if given is None else np.frexp(given.astype(np.float64))[1].astype(np.int64)
     lengths = coder.symbols(name, zero, lengths)
-    return _code_bits(coder, np.minimum(lengths, 1), np.maximum(lengths - 1, 0), given)
+    return code_bits(coder, np.minimum(lengths, 1), np.maximum(lengths - 1, 0), given)
 
 
 def _code_scales(coder: Coder, zero: np.ndarray, given: np.ndarray | None) -> np.ndarray:
@@ -229,12 +229,12 @@ def _code_values(
     if len(rare):
         wide = None if given is None else given[rare] + _OFFSET
         widths = np.full(len(rare), _ESCAPE_BITS)
-        found[rare] = _code_bits(coder, np.zeros(len(rare), np.int64), widths, wide) - _OFFSET
+        found[rare] = code_bits(coder, np.zeros(len(rare), np.int64), widths, wide) - _OFFSET
     return found
 
 
-def _code_bits(coder: Coder, high: np.ndarray, widths: np.ndarray, given: np.ndarray | None) -> np.ndarray:
-    """`high` with `widths` bits appended: for all values the highest 14 or fewer, then the next."""
+def code_bits(coder: Coder, high: np.ndarray, widths: np.ndarray, given: np.ndarray | None) -> np.ndarray:
+    """Code `high` with `widths` bits appended: for all values the highest 14 or fewer, then the next."""
     found, left = high, widths
     while left.any():
         now = np.minimum(left, BITS)

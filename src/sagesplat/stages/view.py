@@ -181,7 +181,7 @@ def is_finished(run: RunDir) -> bool:
 
 @dataclass(frozen=True)
 class _Chunk:
-    sha256: str
+    uri: str
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ class _Chunks:
 
 def _is_current(run: RunDir, folder: Path) -> bool:
     """Whether a bundle has the run's chunks, and promises and a target no older than the run's."""
-    from sagesplat.formats.increments import DIGITS, INDEX
+    from sagesplat.formats.increments import INDEX
 
     if not (folder / MANIFEST).exists():
         return False
@@ -217,8 +217,8 @@ def _is_current(run: RunDir, folder: Path) -> bool:
     listed = known_json(run.increments / INDEX, _Chunks)
     if manifest is None or listed is None:  # `bundle` says what is wrong with the run
         return False
-    held = {level.sha256 for label in manifest.labels for cell in label.cells for level in cell.levels}
-    chunks = {chunk.sha256[:DIGITS] for chunk in listed.chunks}
+    held = {some.uri for label in manifest.labels for cell in label.cells for some in cell.levels}
+    chunks = {f"chunks/{chunk.uri}" for chunk in listed.chunks}  # names of files hold their hashes
     made = (folder / MANIFEST).stat().st_mtime
     newer = (path for path in (run.fidelity, run.promises, run.plan) if path.exists())
     return held == chunks and all(path.stat().st_mtime <= made for path in newer)

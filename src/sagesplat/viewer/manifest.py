@@ -20,10 +20,17 @@ from sagesplat import __version__
 from sagesplat.adapt.cell_models import FidelityModel
 from sagesplat.adapt.cells import STEPS, Cells
 from sagesplat.adapt.viewpoint import QualityKind, ViewModel
-from sagesplat.formats.increments import DIGITS, Increment, full_scene, palettes_of
+from sagesplat.formats.increments import (
+    DIGITS,
+    DIGITS_OF_RANGE,
+    GPU_BYTES, Increment,
+    full_scene,
+    palettes_of,
+)
 from sagesplat.scene.scene import Camera
 from sagesplat.viewer import frames
 from sagesplat.viewer.frames import FLIP
+from sagesplat.viewer.numbers import packed
 from sagesplat.viewer.pack import ASPECT, FOV_Y, HEIGHT, Ladder, order_of
 from sagesplat.viewer.promises import Seen, fidelity_document, of_cells, ssim_document
 from sagesplat.viewer.quality import (
@@ -150,13 +157,13 @@ def documents(
         around = [*contents.drawn, *(entry.camera for entry in contents.cameras)]
         given = {c.label_id: c.fidelity for c in contents.categories if c.label_id in models and c.fidelity}
         document = fidelity_document(given, contents.levels, contents.last, around)
-        promises["fidelity"] = dumped(document)
+        promises["fidelity"] = dumped(packed(document))
         counts = {cell: len(levels) for cell, levels in contents.levels.items()}
         entries["fidelity"] = fidelity_entries(models, contents.shown, contents.drawn, counts)
     if ssim:
         seen = {c.label_id: c.seen for c in contents.categories if c.seen is not None}
         photos = [entry.camera for entry in contents.cameras]
-        promises["ssim"] = dumped(ssim_document(ssim, photos, seen))
+        promises["ssim"] = dumped(packed(ssim_document(ssim, photos, seen)))
         entries["ssim"] = {label: quality_entry(model) for label, model in ssim.items()}
     cells, palettes = _cells(contents), _palettes(contents)
     manifest = {
@@ -172,8 +179,8 @@ def documents(
         "totals": {
             "count": sum(chunk.count for chunk in full),
             "bytes": sum(chunk.nbytes for chunk in full) + sum(one["bytes"] for one in palettes.values()),
-            "gpuBytes": sum(chunk.gpu_bytes for chunk in full),
         },
+        "gpuBytes": GPU_BYTES[contents.sh_degree],
         **({} if contents.ladder is None else {"ladder": contents.ladder}),
         "labels": [
             _label(c, cells[c.label_id], palettes.get(c.label_id), entries, c.name in contents.hidden)
@@ -251,7 +258,7 @@ def _cells(contents: Contents) -> dict[int, list[dict[str, Any]]]:
     """By label id, the entries of its cells."""
     found: dict[int, list[dict[str, Any]]] = {}
     for row, (cell, label) in enumerate(contents.shown.label_of.items()):
-        levels = [_level(chunk, i == 0) for i, chunk in enumerate(contents.files[cell])]
+        levels = [_levels(run) for run in _runs(contents.files[cell])]
         found.setdefault(label, []).append({**placed(contents.shown, row), "levels": levels})
     return found
 
@@ -281,18 +288,29 @@ def placed(cells: Cells, row: int) -> dict[str, Any]:
     }
 
 
-def _level(chunk: Increment, first: bool) -> dict[str, Any]:
-    begins = chunk.format == "stream" and (first or chunk.refine == "REPLACE")
+def _runs(chunks: Sequence[Increment]) -> list[list[Increment]]:
+    """The increments of a cell, those of a stream together."""
+    runs: list[list[Increment]] = []
+    for chunk in chunks:
+        if chunk.format == "stream" and chunk.refine != "REPLACE" and runs and runs[-1][0].uri == chunk.uri:
+            runs[-1].append(chunk)
+        else:
+            runs.append([chunk])
+    return runs
+
+
+def _levels(run: Sequence[Increment]) -> dict[str, Any]:
+    first, is_stream = run[0], run[0].format == "stream"
+    weights = [round(chunk.weight, 6) for chunk in run if chunk.weight is not None]
     return {
-        "uri": f"chunks/{chunk.uri}",
-        "format": chunk.format,
-        **({"refine": "REPLACE"} if chunk.refine == "REPLACE" else {}),
-        **({"offset": chunk.offset} if begins else {}),  # the others follow
-        **({} if chunk.weight is None else {"weight": round(chunk.weight, 6)}),
-        "bytes": chunk.nbytes,
-        "gpuBytes": chunk.gpu_bytes,
-        "count": chunk.count,
-        "sha256": chunk.sha256[:DIGITS],
+        "uri": f"chunks/{first.uri}",
+        "format": first.format,
+        **({"refine": "REPLACE"} if first.refine == "REPLACE" else {}),
+        **({"offset": first.offset} if is_stream else {}),
+        **({"weights": weights} if weights else {}),
+        "bytes": [chunk.nbytes for chunk in run],
+        "counts": [chunk.count for chunk in run],
+        "sha256": "".join(chunk.sha256[: DIGITS_OF_RANGE if is_stream else DIGITS] for chunk in run),
     }
 
 

@@ -112,7 +112,7 @@ def write_pack(
     """Write increments of a manifest's labels, which are in `folder`, as one pack; its manifest entry."""
     unnamed, digest, size = folder / "scene.pack", hashlib.sha256(), 0
     levels = {
-        cell["id"]: ranges_of([(one["uri"], one.get("offset"), one["bytes"]) for one in cell["levels"]])
+        cell["id"]: ranges_of((some["uri"], some.get("offset", 0), some["bytes"]) for some in cell["levels"])
         for label in labels
         for cell in label["cells"]
     }
@@ -133,7 +133,7 @@ def beginning_of(manifest: Mapping[str, Any]) -> int:
     """Bytes of the first levels at the beginning of a manifest's pack, which every plan wants."""
     levels = {cell["id"]: cell["levels"] for label in manifest["labels"] for cell in label["cells"]}
     first = takewhile(lambda one: one[1] == 1, manifest["pack"]["order"])
-    return sum(levels[cell][0]["bytes"] for cell, _ in first)
+    return sum(levels[cell][0]["bytes"][0] for cell, _ in first)
 
 
 def _path(ladder: Ladder, wanted: int) -> np.ndarray:

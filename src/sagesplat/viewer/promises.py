@@ -8,8 +8,8 @@ A process is written as its values at the model's views, not as weights. Weights
 many digits; a value that is rounded moves the mean by about as much. A reader solves for them
 (`viewer.sent_model`). An offset holds what does not depend on the viewpoint: the mean of fidelity, and what
 views differ by that training never saw. Numbers are whole steps of a unit. The shared views, and the photos,
-are in the order of a path from each to the nearest one left, and lists over them hold differences to the one
-before: most are small. Values of SSIM hold differences to the level below as well.
+are in the order of a path from each to the nearest one left, so that differences to the one before are small
+(`viewer.numbers`).
 """
 
 import math
@@ -80,8 +80,8 @@ def _head(
         "extent": some.extent,
         "focal": significant(some.focal),
         "screens": significant(some.screens),
-        "views": [_differences(column) for column in shared.T],
-        "photos": [_differences(column) for column in photos],
+        "views": shared.T.tolist(),
+        "photos": photos.tolist(),
     }
     return head, shared, photos
 
@@ -134,11 +134,12 @@ def _cell(cell: CellModel, columns: Int[np.ndarray, " k"], order: Int[np.ndarray
         "id": cell.cell,
         "ladder": (columns + 1).tolist(),
         "medianLogDistance": cell.median_log_distance,
-        "offsets": cell.offsets[columns].tolist(),
-        "views": _differences(place[by_place]),
-        "logDistances": {"unit": LOG_STEP, "steps": _differences(logs)},
+        "offsets": _whole(cell.offsets[columns] / STEP),
+        "rows": place[by_place].tolist(),
+        "logUnit": LOG_STEP,
+        "logDistances": _whole(logs),
         "terms": cell.values[:, by_place].tolist(),
-        "factors": _differences(factors[order]),
+        "factors": _whole(factors[order]),
     }
 
 
@@ -202,10 +203,10 @@ def _entry(
         "levels": list(model.levels),
         "medianLogDistance": significant(model.median_log_distance),
         "curves": [curve_entry(curve) for curve in model.curves],
-        "offsets": offsets.round(6).tolist(),
-        "views": _differences(places[sent]),
-        "shares": _differences(np.round(shares / STEP)),
-        "corrections": _differences(np.round(np.nan_to_num(corrections) / CORRECTION_STEP)),
+        "offsets": _whole(offsets / STEP),
+        "rows": places[sent].tolist(),
+        "shares": _whole(shares / STEP),
+        "corrections": _whole(np.nan_to_num(corrections) / CORRECTION_STEP),
     }
     return _rounded(entry, whole, replace(model, **ordered), shared, photos, head)
 
@@ -247,13 +248,15 @@ def _with_values(
     """The model's entry with log distances and values, by which it predicts what the model does."""
     own, some = model.inputs, _sent_views(len(model.inputs))
     logs = np.round(own[some, -1] / log_unit)
-    views = shared[np.cumsum(whole["views"])] / STEPS_PER_UNIT * AXES
+    views = shared[whole["rows"]] / STEPS_PER_UNIT * AXES
     inputs = np.column_stack([views, logs * log_unit])
     values = values_at(inputs, own, model.weights, model.lengths)
     return {
         **whole,
-        "logDistances": {"unit": log_unit, "steps": _differences(logs)},
-        "values": {"units": units, "steps": _differences(np.round((values / units).T))},
+        "logUnit": log_unit,
+        "logDistances": _whole(logs),
+        "units": units,
+        "values": np.diff(np.round(values / units).astype(int), prepend=0).T.tolist(),
     }
 
 
@@ -283,11 +286,8 @@ def _thresholds(calibration: Calibration, change: float) -> dict[str, list[int]]
     return {"targets": targets.tolist(), "thresholds": raised.tolist(), "slopes": slopes.tolist()}
 
 
-def _differences(whole: np.ndarray) -> list[Any]:
-    """Differences along each axis, of whole numbers; the first ones are kept."""
-    for axis in range(whole.ndim):
-        whole = np.diff(whole, axis=axis, prepend=0)
-    return whole.astype(int).tolist()
+def _whole(numbers: np.ndarray) -> list[Any]:
+    return np.round(numbers).astype(int).tolist()
 
 
 def _sent_views(views: int) -> slice:

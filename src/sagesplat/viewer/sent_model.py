@@ -6,7 +6,7 @@ Fidelity is read as the models of cells that were calibrated (`read_fidelity`), 
     (C + NUGGET I) weights = values,        C_ij = c(x_i, x_j), the kernel of `adapt.process`
     mean_k = curve_k(d) + offset_k + sum_i c(x, x_i) weights_ik
 
-Numbers are whole steps of a unit, lists over views hold differences to the view before (`viewer.promises`).
+Numbers are whole steps of a unit (`viewer.promises`), in documents that are unpacked (`viewer.numbers`).
 """
 
 from collections.abc import Sequence
@@ -98,7 +98,7 @@ def model_of_entry(
     return SentModel(
         levels=tuple(whole["levels"]),
         curves=tuple(curve_of(curve) for curve in whole["curves"]),
-        offsets=np.array(whole["offsets"], np.float64),
+        offsets=np.array(whole["offsets"]) / STEPS_PER_UNIT,
         extent=document["extent"],
         median_log_distance=whole["medianLogDistance"],
         screens=(screens[0], screens[1]),
@@ -106,7 +106,7 @@ def model_of_entry(
         lengths=_lengths(entry),
         photos=(photos.T / STEPS_PER_UNIT * AXES[:6]).T,
         weights=_weights(whole, inputs, entry["lengths"]),
-        corrections=np.cumsum(whole["corrections"]) * CORRECTION_STEP,
+        corrections=np.array(whole["corrections"]) * CORRECTION_STEP,
         calibration=calibration_of(entry),
     )
 
@@ -140,12 +140,12 @@ def read_fidelity(document: dict[str, Any]) -> dict[int, FidelityModel]:
 def _cell(cell: dict[str, Any], views: Float[np.ndarray, "U 8"], last: int, most: int) -> CellModel:
     """The model of a cell with `most` levels; `last`: of the ladder."""
     columns = np.minimum(np.arange(most), len(cell["ladder"]) - 1)
-    inputs, factors = _inputs(cell, views), np.cumsum(cell["factors"])
+    inputs, factors = _inputs(cell, views), np.array(cell["factors"], int)
     return CellModel(
         cell=cell["id"],
-        offsets=np.array(cell["offsets"], np.float64)[columns],
+        offsets=np.array(cell["offsets"])[columns] / STEPS_PER_UNIT,
         places=(np.array(cell["ladder"])[columns] - 0.5) / last,
-        rows=np.cumsum(np.array(cell["views"], int)),
+        rows=np.array(cell["rows"], int),
         log_distances=inputs[:, -1],
         median_log_distance=cell["medianLogDistance"],
         values=np.array(cell["terms"], int),
@@ -165,15 +165,14 @@ def calibration_of(entry: dict[str, Any]) -> Calibration:
 
 def _inputs(cell: dict[str, Any], views: Float[np.ndarray, "U 8"]) -> Float[np.ndarray, "n 9"]:
     """The inputs of a cell's views."""
-    logs = np.cumsum(cell["logDistances"]["steps"]) * cell["logDistances"]["unit"]
-    return np.column_stack([views[np.cumsum(np.array(cell["views"], int))], logs])
+    logs = np.array(cell["logDistances"]) * cell["logUnit"]
+    return np.column_stack([views[np.array(cell["rows"], int)], logs])
 
 
 def _weights(
     cell: dict[str, Any], inputs: Float[np.ndarray, "n 9"], lengths: Sequence[float]
 ) -> Float[np.ndarray, "n K"]:
-    values = np.cumsum(np.cumsum(cell["values"]["steps"], 0), 1).T * cell["values"]["units"]
-    return weights_from(inputs, values, lengths)
+    return weights_from(inputs, np.cumsum(cell["values"], 0).T * cell["units"], lengths)
 
 
 def _lengths(entry: dict[str, Any]) -> _Lengths:
@@ -182,4 +181,4 @@ def _lengths(entry: dict[str, Any]) -> _Lengths:
 
 
 def _steps(columns: Sequence[Sequence[int]]) -> Int[np.ndarray, "U D"]:
-    return np.cumsum(np.array(columns, int), 1).T
+    return np.array(columns, int).T

@@ -160,9 +160,10 @@ def _camera_files(folder: Path, size: int) -> list[bytes]:
 
 
 def _bundled(folder: Path, size: int) -> list[bytes]:
-    chunk = {"uri": "chunks/a.spz", "count": 3, "bytes": 9, "gpuBytes": 9, "sha256": "0" * 64}
+    chunk = {"uri": "chunks/a.spz", "counts": [3], "bytes": [9], "sha256": "0" * 12}
     files = [chunk, chunk | {"refine": "REPLACE"}] * size
-    ranges = [chunk | {"uri": "chunks/a.sgst", "offset": 9 * i, "weight": 0.5} for i in range(size)]
+    stream = {"counts": [3] * size, "bytes": [9] * size, "weights": [0.5] * size}
+    ranges = [chunk | stream | {"uri": "chunks/a.sgst", "offset": 9}]
     cells = [{"id": i, "levels": levels} for i, levels in enumerate((files, ranges))]
     labels = [{"id": 3, "title": "sky", "cells": cells}]
     return as_json(*({"format": "sagesplat-bundle", "antialiased": True, "labels": [one]} for one in labels))
@@ -309,7 +310,7 @@ def _manifest(folder: Path, size: int) -> list[bytes]:
         json.dumps({"format": "spz", "chunks": [CHUNK | {"uri": "2-1.spz"}]}).encode(),
     )
     put(folder / "run/nested/promises.json", b"{}")
-    levels = [{"uri": "chunks/2-1.spz", "sha256": "0" * 64, "nbytes": 9}]
+    levels = [{"uri": "chunks/2-1.spz"}]
     cells = [{"id": i, "levels": levels} for i in range(size)]
     labels = [{"id": 2 + i, "name": "sky", "cells": cells[i : i + 2]} for i in range(size)]
     return as_json({"format": "sagesplat-bundle", "version": 1, "ladder": "aa", "labels": labels})

@@ -31,7 +31,8 @@ export interface File {
   readonly uri: string;
   readonly offset?: number; // where a range of a larger file begins
   readonly bytes: number;
-  readonly sha256: string;
+  readonly key: string; // its own; the same of the same content in a pack
+  readonly sha256: string; // or its first digits
 }
 
 /** Why a download failed; with `lasting`, a retry is useless. */

@@ -41,7 +41,7 @@ export class Downloads {
   private pack: Pack | null = null; // null also once it turned out to be of no use
   private damaged = 0; // damaged files of the pack
   private roundTrip = Infinity; // ms
-  private readonly unverified = new Set<string>(); // files of a pack whose hash could not be checked
+  private readonly suspects = new Set<string>(); // files that nothing had checked, and that could not be used
   private readonly loads = new Loads();
   private ranges: ReadonlyMap<string, readonly File[]> = new Map(); // of files, by uri
   /** Whether the server answers with ranges; null: it was not asked. */
@@ -86,7 +86,7 @@ export class Downloads {
   }
 
   isHere(file: File): boolean {
-    return this.arrived.has(file.sha256) || this.cache.has(file.sha256);
+    return this.arrived.has(file.key) || this.cache.has(file.key);
   }
 
   /** Arrived files that were not taken, with their rank in the order of arrival. */
@@ -96,29 +96,30 @@ export class Downloads {
 
   /** The content, if it has arrived; it stays in the cache while there is room. */
   take(file: File): Uint8Array | undefined {
-    const content = this.arrived.get(file.sha256) ?? this.cache.get(file.sha256);
-    this.arrived.delete(file.sha256);
+    const content = this.arrived.get(file.key) ?? this.cache.get(file.key);
+    this.arrived.delete(file.key);
     return content;
   }
 
   failure(file: File): Failure | undefined {
-    return this.failures.get(file.sha256);
+    return this.failures.get(file.key);
   }
 
   /** Whether a file must not be retried yet. */
   isBackingOff(file: File): boolean {
-    const failure = this.failures.get(file.sha256);
+    const failure = this.failures.get(file.key);
     return failure !== undefined && (failure.lasting || failure.until > this.link.clock.now());
   }
 
-  /** Reports a file that arrived intact but is unusable. */
+  /** Reports a file that cannot be used. One that nothing has checked is fetched once more. */
   markCorrupt(file: File, message: string): void {
-    if (this.unverified.delete(file.sha256)) {
-      this.cache.drop(file.sha256);
+    if (!this.link.digest && !this.suspects.has(file.key)) {
+      this.suspects.add(file.key);
+      this.cache.drop(file.key);
       this.fail(file, new DamagedError(message, false));
       return;
     }
-    this.failures.set(file.sha256, { message, lasting: true, tries: 1, until: Infinity });
+    this.failures.set(file.key, { message, lasting: true, tries: 1, until: Infinity });
   }
 
   /** Starts the best of the wanted downloads, as many as the link can use. */
@@ -148,10 +149,10 @@ export class Downloads {
 
   private fromPack(file: File, missing: readonly File[]): readonly File[] {
     if (!this.pack) return [];
-    const sound = missing.filter(({ sha256 }) => !this.failures.has(sha256)); // damaged there, perhaps
-    const keys = new Set(sound.map(({ sha256 }) => sha256));
-    if (!keys.has(file.sha256)) return [];
-    return this.pack.around(file, (sha256) => keys.has(sha256), Math.max(this.room, this.few));
+    const sound = missing.filter(({ key }) => !this.failures.has(key)); // damaged there, perhaps
+    const keys = new Set(sound.map(({ key }) => key));
+    if (!keys.has(file.key)) return [];
+    return this.pack.around(file, (key) => keys.has(key), Math.max(this.room, this.few));
   }
 
   /** Bytes of ranges that one request brings at least, if they are wanted. */
@@ -174,6 +175,7 @@ export class Downloads {
   /** Forgets failures, so that all files may be retried immediately. */
   clearFailures(): void {
     this.failures.clear();
+    this.suspects.clear();
   }
 
   close(): void {
@@ -211,9 +213,9 @@ export class Downloads {
   }
 
   private store(file: File, content: Uint8Array): void {
-    this.failures.delete(file.sha256);
-    this.arrived.set(file.sha256, content);
-    this.cache.put(file.sha256, content);
+    this.failures.delete(file.key);
+    this.arrived.set(file.key, content);
+    this.cache.put(file.key, content);
   }
 
   private async run(files: readonly File[]): Promise<void> {
@@ -221,7 +223,7 @@ export class Downloads {
     const [file] = files as readonly [File];
     const isPack = file.uri === this.pack?.files[0]?.uri;
     const load = this.loads.begin(files, isPack);
-    const again = files.some(({ sha256 }) => this.failures.has(sha256));
+    const again = files.some(({ key }) => this.failures.has(key));
     try {
       if (file.offset === undefined) await this.runFile(load, file, again);
       else await this.runRanges(load, files, again);
@@ -246,9 +248,7 @@ export class Downloads {
     const content = await download(this.link, file, load.abort, again, (got) => {
       load.got = got;
     });
-    if (load.dropped) return;
-    this.unverified.delete(file.sha256);
-    this.store(file, content);
+    if (!load.dropped) this.store(file, content);
   }
 
   private async runRanges(load: Load, files: readonly File[], again: boolean): Promise<void> {
@@ -271,11 +271,7 @@ export class Downloads {
         this.loads.claim(load, all);
       },
       take: (file, content) => {
-        came(file, () => {
-          if (isPack && !this.link.digest) this.unverified.add(file.sha256);
-          else this.unverified.delete(file.sha256);
-          this.store(file, content);
-        });
+        came(file, () => this.store(file, content));
       },
       corrupt: (file, error) =>
         came(file, () => {
@@ -291,11 +287,11 @@ export class Downloads {
 
   private fail(file: File, error: unknown): void {
     const { clock } = this.link;
-    const tries = (this.failures.get(file.sha256)?.tries ?? 0) + 1;
+    const tries = (this.failures.get(file.key)?.tries ?? 0) + 1;
     const known = error instanceof DownloadError ? error : new DownloadError(`${file.uri}: ${error}`, true);
     const lasting = known.lasting || (known instanceof DamagedError && tries > 1);
     const wait = Math.min(FIRST_WAIT * 2 ** (tries - 1), LONGEST_WAIT);
-    this.failures.set(file.sha256, { message: known.message, lasting, tries, until: clock.now() + wait });
+    this.failures.set(file.key, { message: known.message, lasting, tries, until: clock.now() + wait });
     if (!lasting) {
       clock.after(wait, () => {
         if (!this.closed) this.options.changed();

@@ -18,7 +18,7 @@ const NEARLY_COMPLETE_WHOLE = 2 ** 22; // the same of a file whose ranges cannot
 const bytesOf = (files: readonly File[]): number => files.reduce((sum, { bytes }) => sum + bytes, 0);
 
 export class Loads {
-  private readonly byKey = new Map<string, Load>(); // of files that are not here yet, by sha-256
+  private readonly byKey = new Map<string, Load>(); // of files that are not here yet, by key
 
   get all(): Set<Load> {
     return new Set(this.byKey.values());
@@ -31,8 +31,8 @@ export class Loads {
     return left;
   }
 
-  has({ sha256 }: File): boolean {
-    return this.byKey.has(sha256);
+  has({ key }: File): boolean {
+    return this.byKey.has(key);
   }
 
   begin(files: readonly File[], isPack = false): Load {
@@ -50,16 +50,16 @@ export class Loads {
 
   /** Files that no other request brings are this one's. */
   claim(load: Load, files: readonly File[]): void {
-    for (const { sha256 } of files) if (!this.byKey.has(sha256)) this.byKey.set(sha256, load);
+    for (const { key } of files) if (!this.byKey.has(key)) this.byKey.set(key, load);
   }
 
-  brings(load: Load, { sha256 }: File): boolean {
-    return this.byKey.get(sha256) === load;
+  brings(load: Load, { key }: File): boolean {
+    return this.byKey.get(key) === load;
   }
 
   /** Takes note that a file of a request has come; whether the request was to bring it. */
   came(load: Load, file: File): boolean {
-    return this.brings(load, file) && this.byKey.delete(file.sha256);
+    return this.brings(load, file) && this.byKey.delete(file.key);
   }
 
   end(load: Load): void {
@@ -75,9 +75,9 @@ export class Loads {
 
   /** Forgets a file that has come otherwise, and its request if it brings nothing else. */
   forget(file: File): void {
-    const load = this.byKey.get(file.sha256);
+    const load = this.byKey.get(file.key);
     if (!load) return;
-    if (load.files.some((one) => one.sha256 !== file.sha256 && this.brings(load, one))) this.came(load, file);
+    if (load.files.some((one) => one.key !== file.key && this.brings(load, one))) this.came(load, file);
     else this.drop(load);
   }
 
@@ -90,7 +90,7 @@ export class Loads {
         load.got > 0.8 * size
       )
         continue;
-      if (!load.files.some((file) => wanted.has(file.sha256) && this.brings(load, file))) this.drop(load);
+      if (!load.files.some((file) => wanted.has(file.key) && this.brings(load, file))) this.drop(load);
     }
   }
 }

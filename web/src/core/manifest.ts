@@ -1,6 +1,7 @@
 /** Reads and validates manifest.json and promises-*.json by their schema, and by what a schema cannot say. */
 
 import root from "../../../src/sagesplat/viewer/manifest.schema.json";
+import type * as documents from "../documents";
 import {
   type Cell,
   type CellPromises,
@@ -13,6 +14,7 @@ import {
   type Quality,
 } from "../types";
 import type { Fetch, File } from "./download";
+import { unpacked } from "./numbers";
 import { filesOf } from "./pack";
 import { levelsOf } from "./quality";
 import { BundleError, checked, refuse, type Schema } from "./schema";
@@ -36,7 +38,9 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
       `${file}: the bundle has version ${version}, this viewer reads version ${VERSION}. Open it with the index.html that came with it.`,
     );
   }
-  const found = withOffsets(checked<Manifest>(value, root, file));
+  const document = checked<documents.Manifest>(value, root, file);
+  refuse(document.labels.flatMap(levelsDefects), file);
+  const found = expanded(document);
   refuse(
     [
       ...(repeats(found.labels) ? ["labels have the same id twice"] : []),
@@ -50,21 +54,66 @@ export function parseManifest(json: string, file = "manifest.json"): Manifest {
   return found;
 }
 
-/** The manifest with the offsets of all ranges: one without follows the one below. */
-function withOffsets(manifest: Manifest): Manifest {
-  const follow = (levels: readonly Level[]): Level[] => {
-    let end = Number.NaN; // none
-    return levels.map((level) => {
-      if (level.format !== "stream") return level;
-      const { offset = level.refine ? Number.NaN : end } = level;
-      end = offset + level.bytes;
-      return { ...level, offset };
-    });
+/** The manifest with the levels of cells one by one, and a key for each file and range. */
+function expanded(document: documents.Manifest): Manifest {
+  const { fidelity, ssim } = document.promises;
+  const keyed = <T extends { sha256: string }>(file: T) => ({ ...file, key: file.sha256 });
+  const labels = document.labels.map(({ palette, ...label }) => ({
+    ...label,
+    ...(palette && { palette: keyed(palette) }),
+    cells: label.cells.map((cell) => ({
+      ...cell,
+      levels: cell.levels.flatMap((some) => levelsIn(some, document.gpuBytes)),
+    })),
+  }));
+  return {
+    ...document,
+    labels,
+    promises: { ...(fidelity && { fidelity: keyed(fidelity) }), ...(ssim && { ssim: keyed(ssim) }) },
+    totals: { ...document.totals, gpuBytes: document.gpuBytes * document.totals.count },
   };
-  const labels = manifest.labels.map((label) => {
-    return { ...label, cells: label.cells.map((cell) => ({ ...cell, levels: follow(cell.levels) })) };
+}
+
+/** The levels of a file or stream. */
+function levelsIn(some: documents.Levels, gpuBytes: number): Level[] {
+  const { uri, format, offset, sha256, refine, weights, counts } = some;
+  const digits = sha256.length / counts.length;
+  let end = offset ?? 0;
+  return some.bytes.map((bytes, i) => {
+    const [count, weight, begin] = [counts[i] as number, weights?.[i], end];
+    end += bytes;
+    return {
+      uri,
+      format,
+      ...(offset !== undefined && { offset: begin }),
+      bytes,
+      gpuBytes: gpuBytes * count,
+      count,
+      key: offset === undefined ? uri : `${uri}:${begin}`,
+      sha256: sha256.slice(digits * i, digits * (i + 1)),
+      ...(refine && i === 0 && { refine }),
+      ...(weight !== undefined && { weight }),
+    };
   });
-  return { ...manifest, labels };
+}
+
+/** What is wrong with lists of levels, before they are read. */
+function levelsDefects({ cells }: documents.Label, i: number): string[] {
+  return cells.flatMap(({ levels }, j) =>
+    levels.flatMap(({ format, offset, sha256, weights, bytes, counts }, k) => {
+      const path = `labels[${i}].cells[${j}].levels[${k}]`;
+      const isStream = format === "stream";
+      const even = [counts, weights ?? bytes].every((list) => list.length === bytes.length);
+      return [
+        ...(even ? [] : [`${path} must have a number a level`]),
+        ...(sha256.length % bytes.length ? [`${path}.sha256 must have as many digits for each level`] : []),
+        ...(isStream === (offset !== undefined) ? [] : [`${path} must have an offset if it is a stream`]),
+        ...(isStream || (bytes.length === 1 && !weights)
+          ? []
+          : [`${path} must be one level without a weight, as it is a file`]),
+      ];
+    }),
+  );
 }
 
 const repeats = (all: readonly { readonly id: number }[]): boolean =>
@@ -112,10 +161,6 @@ function streamDefects({ labels }: Manifest): string[] {
     for (const [j, { levels }] of cells.entries()) {
       const odd = (what: string) => wrong.push(`labels[${i}].cells[${j}].levels ${what}`);
       const streams = levels.filter(({ format }) => format === "stream");
-      const files = levels.filter(({ format }) => format !== "stream");
-      if (files.some(({ offset, weight }) => offset !== undefined || weight !== undefined)) {
-        odd("have offsets or weights, which only streams have");
-      }
       const uri = (ranges[0] ?? streams[0])?.uri ?? "";
       ranges.push(...streams);
       if (streams.some((level) => level.uri !== uri) || others.has(uri)) {
@@ -161,7 +206,7 @@ function packDefects(manifest: Manifest): string[] {
 
 /** Parses the viewpoint models of a quality. Throws a BundleError in one line if they are invalid. */
 export function parsePromises(json: string, file: string, quality: Quality): Promises {
-  const found = checked<Promises>(parse(json, file), root, file, PROMISES);
+  const found = checked<Promises>(unpacked(parse(json, file), file), root, file, PROMISES);
   const shared = found.views[0]?.length ?? 0;
   const even = [found.views, found.photos].every((all) => all.every((one) => one.length === all[0]?.length));
   refuse(even ? [] : ["views and photos must have columns of equal length"], file);
@@ -197,31 +242,28 @@ function modelDefects(one: LabelPromises, shared: number): string[] {
 }
 
 function cellModelDefects(one: CellPromises, shared: number): string[] {
-  const [n, K] = [one.views.length, one.offsets.length];
-  const { factors = [], corrections = [], curves = [], shares = [], levels, values, ladder, terms } = one;
+  const [n, K] = [one.rows.length, one.offsets.length];
+  const { factors = [], corrections = [], curves = [], shares = [] } = one;
+  const { levels, units, values, ladder, terms, logDistances, logUnit } = one;
   const has = (list: readonly number[], length: number) => list.length === length || !list.length;
   const fit =
-    [one.logDistances.steps, ...(terms ?? values?.steps ?? [])].every((row) => row.length === n) &&
+    [logDistances, ...(terms ?? values ?? [])].every((row) => row.length === n) &&
     (one.id < 0
-      ? [levels, values?.units, values?.steps].every((list) => list?.length === K)
+      ? [levels, units, values].every((list) => list?.length === K)
       : ladder?.length === K && terms !== undefined) &&
     (curves.length === K || !curves.length) &&
     has(factors, shared) &&
     has(shares, shared) &&
     has(corrections, n) &&
-    (total(one.views) < shared || !n);
+    one.rows.every((row) => row < shared);
   if (!fit) return [" has lists that do not fit together"];
   const wrong: string[] = [];
   if (!isRising(levels ?? ladder ?? [])) wrong.push(".levels must rise");
-  if (!within(factors, 1e6) || !within(corrections, 1e5) || !within(shares, WHOLE))
+  if (!below(factors, 1e6) || !below(corrections, 1e5) || !below(shares, WHOLE))
     wrong.push(" has factors, shares or corrections out of range");
-  const logs = one.logDistances;
-  if (
-    !within(logs.steps, 100 / logs.unit) ||
-    (values?.steps ?? terms ?? []).some((row) => !within(row, MOST))
-  ) {
+  const inRange = (values ?? terms ?? []).every((row) => below(row, MOST));
+  if (!inRange || !below(logDistances, 100 / logUnit) || !below(one.offsets, 9 * WHOLE))
     wrong.push(" has values out of range");
-  }
   return wrong;
 }
 
@@ -233,17 +275,6 @@ const below = (values: readonly number[], most: number): boolean =>
 
 const isRising = (values: readonly number[]): boolean =>
   values.every((value, i) => i === 0 || value > (values[i - 1] ?? 0));
-
-const total = (steps: readonly number[]): number => steps.reduce((sum, step) => sum + step, 0);
-
-/** Whether all running sums are at most so large. */
-function within(steps: readonly number[], most: number): boolean {
-  let sum = 0;
-  return steps.every((step) => {
-    sum += step;
-    return Math.abs(sum) <= most;
-  });
-}
 
 function parse(json: string, file: string): unknown {
   try {

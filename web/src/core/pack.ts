@@ -23,25 +23,25 @@ export class Pack {
   constructor(manifest: Manifest) {
     const { uri = "", order = [] } = manifest.pack ?? {};
     let offset = 0;
-    this.files = filesOf(manifest).map(({ bytes, sha256 }) => {
+    this.files = filesOf(manifest).map(({ bytes, key, sha256 }) => {
       offset += bytes;
-      return { uri, offset: offset - bytes, bytes, sha256 };
+      return { uri, offset: offset - bytes, bytes, key, sha256 };
     });
     const higher = order.findIndex(([, level]) => level > 1);
     this.beginning = higher < 0 ? this.files : this.files.slice(0, higher);
-    this.places = new Map(this.files.map(({ sha256 }, i) => [sha256, i]));
+    this.places = new Map(this.files.map(({ key }, i) => [key, i]));
   }
 
   /**
    * The ranges around a file that one request brings: wanted ones, with small gaps between them.
    *
-   * @param isWanted - also of the file itself; by sha-256
+   * @param isWanted - also of the file itself; by key
    * @param room - bytes that will be asked for now
    */
-  around({ sha256 }: File, isWanted: (sha256: string) => boolean, room: number): readonly File[] {
-    const place = this.places.get(sha256);
+  around({ key }: File, isWanted: (key: string) => boolean, room: number): readonly File[] {
+    const place = this.places.get(key);
     if (place === undefined) return [];
-    const wants = (i: number) => isWanted(this.files[i]?.sha256 ?? "");
+    const wants = (i: number) => isWanted(this.files[i]?.key ?? "");
     const sizeOf = (i: number) => this.files[i]?.bytes ?? 0;
     let [start, end, bytes, gaps] = [place, place + 1, sizeOf(place), 0];
     while (start > 0 && wants(start - 1) && bytes < room) bytes += sizeOf(--start);

@@ -33,6 +33,7 @@ type From = Pick<Viewpoint, "position" | "direction" | "focal" | "lens">;
 
 /** Steps of positions over the extent, directions, log screens and fields, targets, thresholds and slopes. */
 const STEP = 1e-4;
+const STEPS_PER_UNIT = 10_000;
 const CORRECTION_STEP = 5e-3;
 const FACTOR_STEP = 0.05;
 const VALUE_STEP = 0.03;
@@ -171,12 +172,12 @@ export class Views {
   }
 }
 
-/** Rows from the columns of a document, which hold differences. */
+/** Rows from the columns of a document. */
 function byRow(columns: readonly (readonly number[])[]): Float64Array {
   const rows = new Float64Array(columns.length * (columns[0]?.length ?? 0));
   columns.forEach((column, c) => {
-    sums(column, STEP).forEach((value, row) => {
-      rows[row * columns.length + c] = value;
+    column.forEach((steps, row) => {
+      rows[row * columns.length + c] = steps * STEP;
     });
   });
   return rows;
@@ -205,7 +206,8 @@ export class CellModel {
   private weights: Float64Array | null = null; // [J, n], of a cell's terms, or [K, n]
   private readonly shapes: readonly Float64Array[]; // [J] of [K], by how much each term moves the levels
   private readonly known: readonly number[]; // [K] levels with a prediction
-  private readonly own: Int32Array; // [n] rows of the shared views
+  private readonly offsets: readonly number[]; // [K]
+  private readonly own: readonly number[]; // [n] rows of the shared views
   private readonly logDistances: Float64Array; // [n]
   private readonly corrections: Float64Array; // [n]
   private readonly factors: Float64Array; // [V]
@@ -217,12 +219,13 @@ export class CellModel {
     private readonly sent: CellPromises,
     private readonly scale: readonly [number, number, number, number],
   ) {
-    this.shapes = shapesOf(sent, views.levels);
+    this.offsets = sent.offsets.map((steps) => steps / STEPS_PER_UNIT);
+    this.shapes = shapesOf(sent, this.offsets, views.levels);
     this.known = sent.levels ?? sent.offsets.map((_, k) => k + 1);
-    this.own = Int32Array.from(sums(sent.views, 1));
-    this.logDistances = sums(sent.logDistances.steps, sent.logDistances.unit);
-    this.corrections = sums(sent.corrections ?? [], CORRECTION_STEP);
-    this.factors = sums(sent.factors ?? [], 1).map((steps) => (steps < 0 ? -1 : steps * FACTOR_STEP));
+    this.own = sent.rows;
+    this.logDistances = Float64Array.from(sent.logDistances, (steps) => steps * sent.logUnit);
+    this.corrections = Float64Array.from(sent.corrections ?? [], (steps) => steps * CORRECTION_STEP);
+    this.factors = Float64Array.from(sent.factors ?? [], (steps) => (steps < 0 ? -1 : steps * FACTOR_STEP));
     const known = this.factors.filter((factor) => factor >= 0);
     this.usual = known.length ? known.reduce((sum, factor) => sum + factor, 0) / known.length : 1;
   }
@@ -242,7 +245,7 @@ export class CellModel {
       for (let i = 0, at = row * n; i < n; i++) sum += (near[i] as number) * (weights[at + i] as number);
       return sum;
     };
-    const mean = sent.offsets.map((offset, k) => {
+    const mean = this.offsets.map((offset, k) => {
       if (sent.terms) return offset;
       const curve = sent.curves?.[k];
       return (curve ? curveAt(curve, distance) : 0) + offset + moved(k);
@@ -410,7 +413,11 @@ function ownModels(label: Label, { cells }: LabelPromises): readonly CellPromise
 export const levelsOf = ({ cells }: Label): number => Math.max(0, ...cells.map((cell) => cell.levels.length));
 
 /** The terms of a cell's levels, [J] of [K]: cosines over the ladder, times what is missing. */
-function shapesOf({ terms = [], offsets, ladder = [] }: CellPromises, levels: number): Float64Array[] {
+function shapesOf(
+  { terms = [], ladder = [] }: CellPromises,
+  offsets: readonly number[],
+  levels: number,
+): Float64Array[] {
   return terms.map((_, j) =>
     Float64Array.from(offsets, (offset, k) => {
       const missing = offset < 1 ? Math.max(1 - offset, LEAST_MISSING) : 0;
@@ -419,30 +426,16 @@ function shapesOf({ terms = [], offsets, ladder = [] }: CellPromises, levels: nu
   );
 }
 
-/** Values at the own views, by term or by level: those of levels are differences along both. */
-function valuesOf({ values, terms }: CellPromises): Float64Array {
-  if (!values) return Float64Array.from((terms ?? []).flat(), (steps) => steps * VALUE_STEP);
-  const n = values.steps[0]?.length ?? 0;
-  const out = new Float64Array(n * values.steps.length);
-  const level = new Float64Array(n); // whole numbers, so the sums are exact
-  values.steps.forEach((steps, k) => {
-    let along = 0;
-    for (let i = 0; i < n; i++) {
-      along += steps[i] as number;
-      level[i] = (level[i] as number) + along;
-      out[k * n + i] = (level[i] as number) * (values.units[k] as number);
-    }
-  });
-  return out;
-}
-
-/** Running sums of whole numbers, times a unit. */
-function sums(steps: readonly number[], unit: number): Float64Array {
-  let sum = 0;
-  return Float64Array.from(steps, (step) => {
-    sum += step;
-    return sum * unit;
-  });
+/** Values at the own views, by term or by level: those of levels are differences to the level below. */
+function valuesOf({ values, units = [], terms = [] }: CellPromises): Float64Array {
+  if (!values) return Float64Array.from(terms.flat(), (steps) => steps * VALUE_STEP);
+  let level = new Array<number>(values[0]?.length ?? 0).fill(0); // whole numbers, so the sums are exact
+  return Float64Array.from(
+    values.flatMap((steps, k) => {
+      level = level.map((below, i) => below + (steps[i] as number));
+      return level.map((value) => value * (units[k] as number));
+    }),
+  );
 }
 
 /** Monotone values: the mean of the running maximum and the running minimum from the end, in [-1, 1]. */

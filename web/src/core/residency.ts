@@ -209,7 +209,7 @@ export function exchange(
 
 /** The entry of a cell in a new manifest: the old one if its content is the same. */
 function renewed(old: Entry, fresh: Entry, hidden: Hidden, renderer: Renderer): Entry {
-  const files = ({ cell }: Entry) => cell.levels.map((file) => file.sha256 + (file.refine ?? "")).join();
+  const files = ({ cell }: Entry) => cell.levels.map((file) => file.key + (file.refine ?? "")).join();
   const places = ({ cell }: Entry) => [cell.bounds, cell.points, cell.area, cell.radius].join();
   if (files(old) === files(fresh) && places(old) === places(fresh)) {
     old.label = fresh.label;

@@ -201,7 +201,7 @@ export class Streamer {
     const begun = this.clock.now();
     const { models } = this;
     models.see(this.families, this.viewpoint);
-    const isHere = (file: File) => this.palettes.has(file.sha256) || this.downloads.isHere(file);
+    const isHere = (file: File) => this.palettes.has(file.key) || this.downloads.isHere(file);
     const groups = this.families.map((family) => {
       return models.group(family, this.settings, (entry) => this.highest(entry), isHere);
     });
@@ -233,9 +233,9 @@ export class Streamer {
       const most = isDrawn ? e.around : Math.min(e.shown, e.around);
       e.wanted = e.sight.visible ? e.planned : Math.max(e.planned, most);
     }
-    this.wantedKeys = new Set(this.entries.flatMap((e) => e.path.map((f) => f.file.sha256)));
-    if (this.promises) this.wantedKeys.add(this.promises.sha256);
-    for (const { label } of this.entries) if (label.palette) this.wantedKeys.add(label.palette.sha256);
+    this.wantedKeys = new Set(this.entries.flatMap((e) => e.path.map((f) => f.file.key)));
+    if (this.promises) this.wantedKeys.add(this.promises.key);
+    for (const { label } of this.entries) if (label.palette) this.wantedKeys.add(label.palette.key);
   }
 
   /** Highest available level of a cell: below its first damaged increment. */
@@ -305,13 +305,13 @@ export class Streamer {
   /** The palettes that have not arrived of levels that are next. */
   private missingPalettes(): File[] {
     const needed = this.entries.flatMap((entry) => (entry.next && entry.paletteOf(entry.next)) || []);
-    return [...new Set(needed)].filter(({ sha256 }) => !this.palettes.has(sha256));
+    return [...new Set(needed)].filter(({ key }) => !this.palettes.has(key));
   }
 
   private takePalettes(): void {
     for (const palette of this.missingPalettes()) {
       const content = this.downloads.take(palette);
-      if (content) this.palettes.set(palette.sha256, content);
+      if (content) this.palettes.set(palette.key, content);
     }
   }
 
@@ -341,7 +341,7 @@ export class Streamer {
   /** Decodes in the order of arrival, which is that of value. */
   private decodeMore(): void {
     const came = this.downloads.arrivals;
-    const place = (entry: Entry) => came.get(entry.cell.levels[entry.next - 1]?.sha256 ?? "") ?? -1;
+    const place = (entry: Entry) => came.get(entry.cell.levels[entry.next - 1]?.key ?? "") ?? -1;
     for (const entry of [...this.entries].sort((a, b) => place(a) - place(b))) this.decodeNext(entry);
   }
 
@@ -351,10 +351,10 @@ export class Streamer {
     if (!file || entry.decoding || this.decodes >= MAX_DECODES) return;
     if (this.downloads.failure(file)?.lasting) return;
     const palette = entry.paletteOf(level);
-    const bytes = palette && this.palettes.get(palette.sha256);
+    const bytes = palette && this.palettes.get(palette.key);
     if (palette && !bytes) return;
     const content = entry.contents[level - 1] ?? this.downloads.take(file);
-    const known = palette && bytes && { sha256: palette.sha256, bytes };
+    const known = palette && bytes && { key: palette.key, bytes };
     if (content) void this.decode(entry, file, level, content, known);
   }
 

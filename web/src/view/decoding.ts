@@ -15,7 +15,7 @@ export interface Job {
 
 /** A palette as it came, and what it is known by. */
 export interface PaletteBytes {
-  readonly sha256: string;
+  readonly key: string;
   readonly bytes: Uint8Array;
 }
 
@@ -28,7 +28,7 @@ export interface Answer {
 /** The streams that are being decoded, each where it was left. */
 export class Streams {
   private readonly decoders = new Map<number, StreamDecoder<Part>>();
-  private readonly palettes = new Map<string, Palette>(); // by hash: many streams have the same
+  private readonly palettes = new Map<string, Palette>(); // by key: many streams have the same
 
   /** Decodes the increments of a job; a part for the last one. */
   answer({ id, stream, from, increments, palette }: Job): Answer {
@@ -50,9 +50,9 @@ export class Streams {
     }
   }
 
-  private paletteOf({ sha256, bytes }: PaletteBytes): Palette {
-    const palette = this.palettes.get(sha256) ?? new Palette(bytes);
-    this.palettes.set(sha256, palette);
+  private paletteOf({ key, bytes }: PaletteBytes): Palette {
+    const palette = this.palettes.get(key) ?? new Palette(bytes);
+    this.palettes.set(key, palette);
     return palette;
   }
 }

@@ -186,7 +186,7 @@ test("promises that cannot be read are told of", async () => {
   const { w } = made();
   const text = new TextEncoder().encode("{}");
   w.network.files.set("promises-1.json", text);
-  const promises = { fidelity: { uri: "promises-1.json", bytes: 2, sha256: "" } };
+  const promises = { fidelity: { uri: "promises-1.json", bytes: 2, sha256: "", key: "" } };
   const other = world({}, { manifest: { ...w.manifest, promises }, digest: null }, w);
   other.streamer.start();
   await other.pass(5000);

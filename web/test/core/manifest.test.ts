@@ -2,28 +2,24 @@
 
 import { readFileSync } from "node:fs";
 import { describe, expect, test } from "vitest";
+import vectors from "../../../tests/data/promises.json?raw";
 import { TYPES, typesOfSchema } from "../../schema";
 import { loadManifest, parseManifest, parsePromises, VERSION } from "../../src/core/manifest";
 import { BundleError } from "../../src/core/schema";
-import type { Level, Manifest } from "../../src/types";
+import type { Manifest as Document } from "../../src/documents";
 import { Network, VirtualClock } from "../simulate";
-import { BASE, base64, bundle } from "../worlds";
+import { BASE, base64, bundle, documentOf, type Options } from "../worlds";
 
 type Json = Record<string, unknown>;
 const network = new Network(new VirtualClock());
-const plain = bundle(network, { labels: 2, levels: 2, bytes: 100 });
+const made = (options: Options): Document =>
+  documentOf(bundle(network, { labels: 2, bytes: 100, ...options }));
+const plain = made({ levels: 2 });
 const promises = JSON.parse(new TextDecoder().decode(network.files.get("promises-1.json")));
-const packed = bundle(network, { labels: 2, levels: 2, bytes: 100, pack: true });
-const streams = bundle(network, { labels: 2, levels: 3, bytes: 100, streams: true });
-const parted = bundle(network, { labels: 2, cells: 3, levels: 2, bytes: 100, streams: true, pack: true });
-const replacing = bundle(network, {
-  labels: 2,
-  cells: 3,
-  levels: 4,
-  bytes: 100,
-  streams: true,
-  replaces: [2, 4],
-});
+const packed = made({ levels: 2, pack: true });
+const streams = made({ levels: 3, streams: true });
+const parted = made({ cells: 3, levels: 2, streams: true, pack: true });
+const replacing = made({ cells: 3, levels: 4, streams: true, replaces: [2, 4] });
 
 /** A document with another value at a path such as labels.0.id; undefined takes it away. */
 function changed(document: unknown, path: string, value: unknown): string {
@@ -55,8 +51,9 @@ test("the types are those of the schema", async () => {
 });
 
 test("a good manifest is taken as it is, with fields of later versions", () => {
-  for (const made of [plain, packed, streams, parted, replacing]) {
-    expect(parseManifest(JSON.stringify(made))).toEqual(JSON.parse(JSON.stringify(made)));
+  for (const options of [{}, { pack: true }, { streams: true, cells: 2, palette: 20, replaces: [3] }]) {
+    const manifest = bundle(network, options);
+    expect(parseManifest(JSON.stringify(documentOf(manifest)))).toEqual(manifest);
   }
   for (const [path, value] of [
     ["labels", []],
@@ -67,22 +64,11 @@ test("a good manifest is taken as it is, with fields of later versions", () => {
   ] as const) {
     expect(parseManifest(changed(plain, path, value))).toBeTruthy();
   }
-  const weighted = streams.labels[0]?.cells[0]?.levels.map((level, k) => ({ ...level, weight: k / 2 }));
-  const found = parseManifest(changed(streams, "labels.0.cells.0.levels", weighted));
+  const found = parseManifest(changed(streams, "labels.0.cells.0.levels.0.weights", [0, 0.5, 1]));
   expect(found.labels[0]?.cells[0]?.levels[1]?.weight).toBe(0.5);
   const files = plain.labels[0]?.cells[0]?.levels.map((level) => ({ ...level, refine: "REPLACE" }));
   const highest = [...(replacing.labels[0]?.cells[2]?.levels ?? []), ...(files ?? [])];
   expect(parseManifest(changed(replacing, "labels.0.cells.2.levels", highest))).toBeTruthy();
-});
-
-test("a range without an offset follows the one below", () => {
-  for (const made of [streams, parted, replacing]) {
-    const short = (level: Level, k: number) => (k && !level.refine ? { ...level, offset: undefined } : level);
-    const labels = made.labels.map((label) => {
-      return { ...label, cells: label.cells.map((cell) => ({ ...cell, levels: cell.levels.map(short) })) };
-    });
-    expect(parseManifest(JSON.stringify({ ...made, labels }))).toEqual(JSON.parse(JSON.stringify(made)));
-  }
 });
 
 test("another version says so, whatever else it holds", () => {
@@ -131,11 +117,12 @@ test.each([
 });
 
 const LEVELS = "labels.0.cells.0.levels";
-const GAPS = "labels[0].cells[0].levels must be ranges without gaps";
+const FILLED = "labels[0].cells must have ranges that fill their file, from byte 0 on";
+const KIND = "labels[0].cells[0].levels[0] must have an offset if it is a stream";
 const ALONE = "labels[0].cells[0].levels must be one stream, in a file of the label's own";
-const [first, second] = (streams.labels[0]?.cells[0]?.levels ?? []) as unknown as [Level, Level];
+const first = streams.labels[0]?.cells[0]?.levels[0];
 
-test.each<[string, unknown, string, Manifest?]>([
+test.each<[string, unknown, string, Document?]>([
   [LEVELS, [], "labels[0].cells[0].levels must be a list of at least 1"],
   ["labels.1.id", 0, "same id"],
   ["labels.1.cells.0.id", 0, "cells have the same id twice"],
@@ -150,12 +137,20 @@ test.each<[string, unknown, string, Manifest?]>([
   ["labels.0.cells.0.points", "AAAA=", "labels[0].cells[0].points must be a list of bytes in base64"],
   ["labels.0.weight", -1, "labels[0].weight must be a number from 0 on"],
   ["labels.0.color", "red", "labels[0].color must be a colour as #rrggbb"],
-  [`${LEVELS}.0.sha256`, "12", "labels[0].cells[0].levels[0].sha256 must be a SHA-256 in hexadecimal"],
-  [`${LEVELS}.0.bytes`, 1.5, "labels[0].cells[0].levels[0].bytes must be a whole number from 1 on"],
+  [`${LEVELS}.0.sha256`, "12", "labels[0].cells[0].levels[0].sha256 must be a text of the first digits"],
+  [`${LEVELS}.0.bytes`, [], "labels[0].cells[0].levels[0].bytes must be a list of at least 1"],
+  [`${LEVELS}.0.bytes`, [1.5], "labels[0].cells[0].levels[0].bytes[0] must be a whole number from 1 on"],
+  [`${LEVELS}.0.counts`, [1, 2], "labels[0].cells[0].levels[0] must have a number a level"],
+  [
+    `${LEVELS}.0.weights`,
+    [1],
+    "labels[0].cells[0].levels[0] must be one level without a weight, as it is a file",
+  ],
   [`${LEVELS}.0.format`, "ksplat", 'must be "stream" or "spz" or "ply"'],
   [`${LEVELS}.0.refine`, "REPLACE", "labels[0].cells[0].levels[0] has nothing to replace"],
   [`${LEVELS}.1.refine`, null, 'levels[1].refine must be "REPLACE"'],
-  [`${LEVELS}.1.offset`, 0, "have offsets or weights, which only streams have"],
+  [`${LEVELS}.0.offset`, 0, KIND],
+  [`${LEVELS}.0.sha256`, "0123456", "labels[0].cells[0].levels[0].sha256 must be"],
   ["labels.0.quality.fidelity.mean", [0], "labels[0].quality.fidelity must have a number a level"],
   ["labels.0.quality.fidelity.bound", [0], "labels[0].quality.fidelity must have a number a level"],
   ["labels.0.quality.fidelity.bound", 3, "labels[0].quality.fidelity.bound must be a list"],
@@ -175,33 +170,22 @@ test.each<[string, unknown, string, Manifest?]>([
   ["pack.order.0", [9, 1], "pack.order must name levels", packed],
   ["pack.order.0", [0, 9], "pack.order must name levels", packed],
   ["pack.order.0", [0, 2], "pack.order must name levels", packed],
-  [`${LEVELS}.0.offset`, undefined, GAPS, streams],
-  [`${LEVELS}.0.offset`, 1, GAPS, streams],
-  ["labels.0.cells.1.levels.0.offset", 1, "labels[0].cells[1].levels must be ranges without gaps", parted],
-  [
-    "labels.0.cells",
-    parted.labels[0]?.cells.slice(1),
-    "labels[0].cells must have ranges that fill their file, from byte 0 on",
-    parted,
-  ],
-  [`${LEVELS}.1.offset`, (second.offset ?? 0) + 1, GAPS, streams],
-  [`${LEVELS}.1.offset`, (second.offset ?? 0) - 1, GAPS, streams],
-  [`${LEVELS}.1.offset`, 0.5, "levels[1].offset must be a whole number from 0 on", streams],
-  [`${LEVELS}.0.bytes`, first.bytes - 1, GAPS, streams],
-  [`${LEVELS}.1.uri`, "chunks/other.sgst", ALONE, streams],
-  [`${LEVELS}.1.format`, "spz", ALONE, streams],
-  [`${LEVELS}.2.offset`, 1, GAPS, replacing],
-  [`${LEVELS}.1.format`, "spz", "offsets or weights, which only streams have", replacing],
-  [`${LEVELS}.2.uri`, "chunks/other.sgst", ALONE, replacing],
-  [`${LEVELS}.1.weight`, 0.5, "levels have weights, and some replace those below", replacing],
-  [`${LEVELS}.1.weight`, 0.5, "labels[0].cells[0].levels must all have a weight, or none", streams],
-  [`${LEVELS}.1.weight`, 1.5, "levels[1].weight must be a number from 0 to 1", streams],
-  [
-    "labels.1.cells.0.levels",
-    streams.labels[1]?.cells[0]?.levels.map((level) => ({ ...level, uri: first.uri })),
-    "labels[1].cells[0].levels must be one stream, in a file of the label's own",
-    streams,
-  ],
+  [`${LEVELS}.0.offset`, undefined, KIND, streams],
+  [`${LEVELS}.0.sha256`, "01234567", "levels[0].sha256 must have as many digits for each level", streams],
+  [`${LEVELS}.0.format`, "spz", KIND, streams],
+  [`${LEVELS}.0.offset`, 1, FILLED, streams],
+  [`${LEVELS}.0.offset`, 0.5, "levels[0].offset must be a whole number from 0 on", streams],
+  ["labels.0.cells.1.levels.0.offset", 1, FILLED, parted],
+  ["labels.0.cells", parted.labels[0]?.cells.slice(1), FILLED, parted],
+  ["labels.0.cells.0.levels.0.bytes.0", 1, FILLED, parted],
+  [LEVELS, [first, first], "labels[0].cells[0].levels must be ranges without gaps", streams],
+  [LEVELS, [first, { ...first, uri: "chunks/other.sgst" }], ALONE, streams],
+  [LEVELS, [first, plain.labels[0]?.cells[0]?.levels[0]], ALONE, streams],
+  [`${LEVELS}.1.offset`, 1, FILLED, replacing],
+  [`${LEVELS}.1.uri`, "chunks/other.sgst", ALONE, replacing],
+  [`${LEVELS}.0.weights`, [0.5], "levels must all have a weight, or none", replacing],
+  [`${LEVELS}.0.weights`, [0, 0.5, 1.5], "levels[0].weights[2] must be a number from 0 to 1", streams],
+  ["labels.1.cells.0.levels.0.uri", first?.uri, ALONE.replace("[0]", "[1]"), streams],
 ])("%s = %j", (path, value, message, document = plain) => {
   expect(refusal(document, path, value)).toContain(message);
 });
@@ -234,19 +218,20 @@ test.each([
   ["labels.0.cells.0.factors.0", 2e6, "labels[0].cells[0] has factors, shares or corrections out of range"],
   ["labels.0.cells.0.corrections", [1], "labels[0].cells[0] has lists"],
   ["labels.0.cells.0.id", -1, "labels have models of cells for fidelity, of the whole label for ssim"],
-  ["labels.0.cells.0.views", [0, 99], "labels[0].cells[0] has lists"],
-  ["labels.0.cells.0.views.1", 99, "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.rows", [0, 99], "labels[0].cells[0] has lists"],
+  ["labels.0.cells.0.rows.1", 99, "labels[0].cells[0] has lists"],
   ["labels.0.cells.0.terms.0", [1], "labels[0].cells[0] has lists"],
   ["labels.0.cells.0.terms.0.0", 1e10, "labels[0].cells[0] has values out of range"],
   ["labels.0.cells.0.ladder", [1], "labels[0].cells[0] has lists"],
-  ["labels.0.cells.0.values", { units: [0], steps: [[]] }, "labels[0].cells[0].values.units[0] must be a"],
+  ["labels.0.cells.0.units", [0], "labels[0].cells[0].units[0] must be a"],
+  ["labels.0.cells.0.offsets.0", 90_001, "labels[0].cells[0] has values out of range"],
   ["labels.0.cells.0.offsets", [0], "labels[0].cells[0] has lists"],
   [
     "labels.0.cells.0.curves",
     [{ level: 1, params: [1, 0, 0, 1, 1, 0, 0, 1, 0], range: [0, 1], median: 1 }],
     "labels[0].cells[0] has lists",
   ],
-  ["labels.0.cells.0.logDistances.steps.0", 1e6, "labels[0].cells[0] has values out of range"],
+  ["labels.0.cells.0.logDistances.0", 1e6, "labels[0].cells[0] has values out of range"],
   ["labels.0.cells.0.levels", [2, 1], "labels[0].cells[0].levels must rise"],
   ["labels.0.lengths", [1, 0, 1, 1], "labels[0].lengths[1]"],
   ["labels.0.lengths", [1, 1, 1], "labels[0].lengths must be a list of 4"],
@@ -265,16 +250,16 @@ test.each([
 
 const { ladder: _, terms: __, ...cell } = promises.labels[0].cells[0];
 const K = cell.offsets.length;
-const values = { units: Array(K).fill(1e-3), steps: Array(K).fill(cell.views) };
-const whole = { ...cell, id: -1, levels: cell.offsets.map((_: number, k: number) => k + 1), values };
+const [units, values] = [Array(K).fill(1e-3), Array(K).fill(cell.rows)];
+const whole = { ...cell, id: -1, levels: cell.offsets.map((_: number, k: number) => k + 1), units, values };
 const ssim = { ...promises, quality: "ssim", labels: [{ ...promises.labels[0], cells: [whole] }] };
 
 test.each([
-  ["values.steps", [], "labels[0].cells[0] has lists"],
-  ["values.steps.0", [1], "labels[0].cells[0] has lists"],
-  ["values.steps.0.0", 1e10, "labels[0].cells[0] has values out of range"],
-  ["values.units.0", 0, "labels[0].cells[0].values.units[0] must be a number from"],
-  ["values.units", [1], "labels[0].cells[0] has lists"],
+  ["values", [], "labels[0].cells[0] has lists"],
+  ["values.0", [1], "labels[0].cells[0] has lists"],
+  ["values.0.0", 1e10, "labels[0].cells[0] has values out of range"],
+  ["units.0", 0, "labels[0].cells[0].units[0] must be a number from"],
+  ["units", [1], "labels[0].cells[0] has lists"],
   ["values", undefined, "labels[0].cells[0] has lists"],
   ["levels", [1, 2, 3, 4, 5], "labels[0].cells[0] has lists"],
 ])("promises of ssim: %s = %j", (path, value, message) => {
@@ -283,12 +268,36 @@ test.each([
   expect(complaint(() => parsed(changed(ssim, `labels.0.cells.0.${path}`, value)))).toContain(message);
 });
 
+const coded = (JSON.parse(vectors).cases as { promises: { quality: string; numbers: string } }[]).find(
+  (one) => one.promises.quality === "fidelity",
+)?.promises;
+const turned = Buffer.from(coded?.numbers ?? "", "base64")
+  .reverse()
+  .toString("base64");
+
+test.each<[string, unknown]>([
+  ["numbers", "AAAA"],
+  ["numbers", ""],
+  ["numbers", "?"],
+  ["numbers", null],
+  ["numbers", turned],
+  ["numbers", `${coded?.numbers.replaceAll("=", "A")}AAAA`],
+  ["views.0", 2 ** 22 + 1],
+  ["views.0", -1],
+  ["views.0", 1e300],
+  ["views.0", 0.5],
+])("numbers that are damaged: %s = %j", (path, value) => {
+  const parsed = (json: string) => parsePromises(json, "p.json", "fidelity");
+  expect(parsed(JSON.stringify(coded)).views).toHaveLength(8);
+  expect(complaint(() => parsed(changed(coded, path, value)))).toContain("p.json: its numbers are damaged");
+});
+
 describe("loading", () => {
   const load = async (prepare: (network: Network) => void) => {
     const clock = new VirtualClock();
     const network = new Network(clock);
     const manifest = bundle(network, { labels: 1, bytes: 100 });
-    network.files.set("manifest.json", new TextEncoder().encode(JSON.stringify(manifest)));
+    network.files.set("manifest.json", new TextEncoder().encode(JSON.stringify(documentOf(manifest))));
     prepare(network);
     const loaded = loadManifest(BASE, network.fetch).then(
       (found) => found.name,

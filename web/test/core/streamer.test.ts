@@ -4,7 +4,7 @@ import { describe, expect, test } from "vitest";
 import { digestOfBrowser } from "../../src/core/download";
 import { type Network, settled } from "../simulate";
 import { shown, type World, wanted, world } from "../world";
-import { at, bundle, FOCAL, NO_BUDGET, rightOf, totals } from "../worlds";
+import { at, bundle, documentOf, FOCAL, NO_BUDGET, rightOf, totals } from "../worlds";
 
 const chunks = (paths: readonly string[]) => paths.filter((path) => path.startsWith("chunks/"));
 const twice = (paths: readonly string[]) => paths.filter((path, i) => paths.indexOf(path) < i);
@@ -261,7 +261,7 @@ test("real digests, where the machine has them", async () => {
 describe("a live bundle", () => {
   const publish = (network: Network, seed: number, labels: number, live = true) => {
     const manifest = bundle(network, { labels, levels: 1, live, seed, promises: false });
-    network.files.set("manifest.json", new TextEncoder().encode(JSON.stringify(manifest)));
+    network.files.set("manifest.json", new TextEncoder().encode(JSON.stringify(documentOf(manifest))));
     return manifest;
   };
   const running = async () => {

@@ -4,6 +4,7 @@ import { describe, expect, test } from "vitest";
 import distances from "../../../tests/data/distances.json?raw";
 import promised from "../../../tests/data/promises.json?raw";
 import { Points } from "../../src/core/distance";
+import { parsePromises } from "../../src/core/manifest";
 import {
   boundOf,
   type CellModel,
@@ -18,7 +19,7 @@ import { entriesOf } from "../../src/core/residency";
 import { familiesOf, ViewpointModels } from "../../src/core/viewpoints";
 import type { Cell, CellPromises, Curve, Label, LabelPromises, Promises, Viewpoint } from "../../src/types";
 import { Network, VirtualClock } from "../simulate";
-import { at, base64, bundle, differences, frustumOf, modelsOf } from "../worlds";
+import { at, base64, bundle, frustumOf, modelsOf } from "../worlds";
 
 /** Null: NaN, or of a focal length, the photos'. */
 type Maybe = number | null;
@@ -60,7 +61,7 @@ interface FidelityView extends Viewpoint {
 interface FidelityCase {
   readonly name: string;
   readonly labels: readonly { readonly id: number; readonly cells: (Place & { numLevels: number })[] }[];
-  readonly promises: Promises;
+  readonly promises: Promises; // packed
   readonly viewpoints: readonly FidelityView[];
 }
 interface SsimCase extends Pick<FidelityCase, "name" | "promises"> {
@@ -78,7 +79,7 @@ function near(found: number, expected: Maybe, what: string, tolerance: number): 
   }
 }
 
-const level = { uri: "a.spz", format: "spz", bytes: 1, gpuBytes: 1, count: 1, sha256: "" } as const;
+const level = { uri: "a.spz", format: "spz", bytes: 1, gpuBytes: 1, count: 1, key: "", sha256: "" } as const;
 const levelled = (place: Place, count: number): Cell => ({
   ...place,
   levels: Array.from({ length: count }, () => level),
@@ -119,7 +120,8 @@ const isOfCells = (one: SsimCase | FidelityCase): one is FidelityCase => one.pro
 test.each(promiseCases.filter((one): one is SsimCase => !isOfCells(one)))(
   "ssim is that of the Python package: $name",
   (one) => {
-    const { promises, viewpoints } = one;
+    const { viewpoints } = one;
+    const promises = parsePromises(JSON.stringify(one.promises), one.name, "ssim");
     const [own] = promises.labels as readonly [LabelPromises];
     const known = own.cells[0]?.levels ?? [];
     const views = new Views(promises);
@@ -143,7 +145,8 @@ test.each(promiseCases.filter((one): one is SsimCase => !isOfCells(one)))(
 );
 
 test.each(promiseCases.filter(isOfCells))("fidelity is that of the Python package: $name", (one) => {
-  const { promises, viewpoints } = one;
+  const { viewpoints } = one;
+  const promises = parsePromises(JSON.stringify(one.promises), one.name, "fidelity");
   const labels = one.labels.map(({ id, cells }) =>
     labelOf(
       id,
@@ -248,7 +251,7 @@ describe("models", () => {
       ...sent,
       labels: sent.labels.map((one) => ({
         ...one,
-        cells: one.cells.map((own) => ({ ...own, factors: differences(factors) })),
+        cells: one.cells.map((own) => ({ ...own, factors })),
       })),
     });
     const shares = (factors: number[], viewpoint = at(-6)) => {
@@ -277,8 +280,8 @@ describe("models", () => {
     const { labels, promises: sent } = promises();
     const bare = (own: CellPromises): CellPromises => ({
       ...own,
-      views: [],
-      logDistances: { unit: 0.01, steps: [] },
+      rows: [],
+      logDistances: [],
       terms: [],
     });
     const all = {
@@ -290,7 +293,8 @@ describe("models", () => {
     models.see(families, at(-6));
     for (const { entries, outlook, label } of families) {
       expect(outlook.trust).toBe("calibrated");
-      for (const { mean } of entries) expect(mean).toEqual(label.quality.fidelity?.mean);
+      const sent = label.quality.fidelity?.mean.map((mean) => Math.round(1e4 * mean) / 1e4);
+      for (const { mean } of entries) expect(mean).toEqual(sent);
     }
     models.see(families, at(1e4));
     for (const { outlook } of families) expect(outlook).toMatchObject({ keeps: null, trust: "outside" });

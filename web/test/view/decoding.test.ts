@@ -53,7 +53,7 @@ function made(count = 1) {
 
 function paletteIn(one: Golden) {
   const bytes = paletteBytesOf(one);
-  return bytes && { sha256: one.name, bytes };
+  return bytes && { key: one.name, bytes };
 }
 
 const many = golden.filter(({ sizes }) => sizes.length > 1);

@@ -4,7 +4,7 @@ import { expect, test } from "vitest";
 import { loadManifest } from "../../src/core/manifest";
 import { bytesFrom, bytesOf, sourceInside } from "../../src/inside";
 import { Network, VirtualClock } from "../simulate";
-import { bundle } from "../worlds";
+import { bundle, documentOf } from "../worlds";
 
 /** A page with these files, as far as it is asked for them. */
 function page(files: Readonly<Record<string, Uint8Array>>): ParentNode {
@@ -23,7 +23,10 @@ test("its files are found by their address in the bundle, and nothing else is", 
   const manifest = bundle(new Network(new VirtualClock()), { labels: 1, levels: 1 });
   const chunk = Uint8Array.from({ length: 300 }, (_, i) => i % 256);
   const source = sourceInside(
-    page({ "manifest.json": new TextEncoder().encode(JSON.stringify(manifest)), "chunks/a-01.spz": chunk }),
+    page({
+      "manifest.json": new TextEncoder().encode(JSON.stringify(documentOf(manifest))),
+      "chunks/a-01.spz": chunk,
+    }),
   );
   if (!source) throw new Error("none");
   expect(await loadManifest(source.base, source.fetch)).toEqual(manifest);

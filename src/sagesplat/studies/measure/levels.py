@@ -109,37 +109,38 @@ def unique_names(levels: Sequence[Level], folders: Sequence[str]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class _BundleLevel:
-    """A level of a category in a bundle's manifest."""
+class _BundleLevels:
+    """Consecutive levels of a cell in a bundle's manifest."""
 
     uri: Annotated[str, Meta(pattern="^chunks/")]
-    count: AtLeast1
-    bytes: AtLeast1
-    gpuBytes: AtLeast1
-    sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{12,64}\Z")]
+    bytes: list[AtLeast1]
+    counts: list[AtLeast1]
     refine: Refine = "ADD"
-    offset: Count | None = None
-    weight: Share | None = None
-
-    def increment(self, label_id: int, cell: int, number: int, offset: int) -> Increment:
-        uri = self.uri.removeprefix("chunks/")
-        sizes = self.count, self.bytes, self.gpuBytes
-        digits = self.sha256.ljust(64, "0")  # a manifest has the first; nothing here compares them
-        return Increment(label_id, cell, number, uri, *sizes, digits, self.refine, offset, self.weight)
+    offset: Count = 0
+    weights: list[Share] | None = None
 
 
 @dataclass(frozen=True)
 class _BundleCell:
     id: LabelId
-    levels: list[_BundleLevel]
+    levels: list[_BundleLevels]
 
     def increments(self, label_id: int) -> list[Increment]:
-        ranges = ranges_of((one.uri, one.offset, one.bytes) for one in self.levels)
-        levels = zip(self.levels, ranges, strict=True)
-        return [
-            level.increment(label_id, self.id, number, offset)
-            for number, (level, (_, offset, _)) in enumerate(levels, 1)
-        ]
+        ranges = iter(ranges_of((some.uri, some.offset, some.bytes) for some in self.levels))
+        found: list[Increment] = []
+        for some in self.levels:
+            weights = some.weights or [None] * len(some.bytes)
+            refines = [some.refine, *["ADD"] * (len(some.bytes) - 1)]
+            for count, weight, refine in zip(some.counts, weights, refines, strict=True):
+                uri, offset, nbytes = next(ranges)
+                found.append(
+                    Increment(
+                        label_id, self.id, len(found) + 1, uri.removeprefix("chunks/"), count, nbytes,
+                        gpu_bytes=count, sha256="0" * 64,  # neither is asked for here
+                        refine=refine, offset=offset, weight=weight,
+                    )  # fmt: skip
+                )
+        return found
 
 
 @dataclass(frozen=True)
