@@ -36,8 +36,8 @@ from sagesplat.studies.measure.levels import levels_of
 from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import is_bundle
 from sagesplat.viewer.frames import camera_at
-from sagesplat.viewer.promises import allowed_change
 from sagesplat.viewer.numbers import unpacked
+from sagesplat.viewer.promises import allowed_change
 from sagesplat.viewer.sent_model import read_fidelity, read_model
 
 

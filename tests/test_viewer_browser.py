@@ -21,6 +21,7 @@ from browser import Opened, open_page
 from make_viewer_vectors import SCREENS, calibration, model
 from page_checks import wrong_with, wrong_with_keyboard
 from PIL import Image
+from test_viewer_bundle import levels_in
 
 from sagesplat.adapt.cell_models import TERMS, CellModel, FidelityModel, views_of
 from sagesplat.adapt.cells import describe_cells

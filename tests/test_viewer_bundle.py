@@ -44,8 +44,8 @@ from sagesplat.viewer.built import has_viewer
 from sagesplat.viewer.bundle import SCHEMA, is_bundle, write_bundle, write_documents
 from sagesplat.viewer.frames import FLIP
 from sagesplat.viewer.manifest import CameraEntry, Category, Contents, documents
-from sagesplat.viewer.pack import Ladder, costs_of, gains_of, order_of
 from sagesplat.viewer.numbers import packed, unpacked
+from sagesplat.viewer.pack import Ladder, costs_of, gains_of, order_of
 from sagesplat.viewer.promises import Seen, allowed_change, fidelity_document, of_cells, ssim_document
 from sagesplat.viewer.quality import (
     curve_entry,

@@ -23,7 +23,8 @@ from sagesplat.adapt.viewpoint import QualityKind, ViewModel
 from sagesplat.formats.increments import (
     DIGITS,
     DIGITS_OF_RANGE,
-    GPU_BYTES, Increment,
+    GPU_BYTES,
+    Increment,
     full_scene,
     palettes_of,
 )

@@ -126,19 +126,26 @@ class _BundleCell:
     levels: list[_BundleLevels]
 
     def increments(self, label_id: int) -> list[Increment]:
-        ranges = iter(ranges_of((some.uri, some.offset, some.bytes) for some in self.levels))
         found: list[Increment] = []
         for some in self.levels:
-            weights = some.weights or [None] * len(some.bytes)
-            refines = [some.refine, *["ADD"] * (len(some.bytes) - 1)]
-            for count, weight, refine in zip(some.counts, weights, refines, strict=True):
-                uri, offset, nbytes = next(ranges)
+            ranges = ranges_of([(some.uri.removeprefix("chunks/"), some.offset, some.bytes)])
+            weights = some.weights or [None] * len(ranges)
+            levels = zip(ranges, some.counts, weights, strict=True)
+            for i, ((uri, offset, nbytes), count, weight) in enumerate(levels):
                 found.append(
                     Increment(
-                        label_id, self.id, len(found) + 1, uri.removeprefix("chunks/"), count, nbytes,
-                        gpu_bytes=count, sha256="0" * 64,  # neither is asked for here
-                        refine=refine, offset=offset, weight=weight,
-                    )  # fmt: skip
+                        label_id,
+                        self.id,
+                        len(found) + 1,
+                        uri,
+                        count,
+                        nbytes,
+                        gpu_bytes=count,
+                        sha256="0" * 64,  # neither is asked for here
+                        refine="ADD" if i else some.refine,
+                        offset=offset,
+                        weight=weight,
+                    )
                 )
         return found
 
