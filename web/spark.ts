@@ -1,4 +1,4 @@
-import type { Plugin } from "vite";
+import { minifySync, type Plugin } from "vite";
 import { backToFront } from "./src/core/sort.ts";
 
 const WASM =
@@ -27,7 +27,10 @@ export function spark(isInline = false): Plugin {
         : `import.meta.ROLLUP_FILE_URL_${this.emitFile({ type: "asset", name: "spark.wasm", source: bytes })}`;
       const changed = replaced(code, [
         [WASM, () => `const WASM_MODULE = lazy(${url});`],
-        [WORKER, () => `const jsContent = ${JSON.stringify(sorting(new Function(`return ${worker}`)()))};`],
+        [
+          WORKER,
+          () => `const jsContent = ${JSON.stringify(small(sorting(new Function(`return ${worker}`)())))};`,
+        ],
         [
           /const initialization = __wbg_init\(\{ module_or_path: WASM_MODULE \}\)\.then\(\n.*\n.*\n.*\n\);/,
           () =>
@@ -75,6 +78,13 @@ ${found}`,
     ],
     [/ {2}function sortSplats32\(/, (found) => `  ${backToFront.toString()}\n${found}`],
   ]);
+}
+
+/** A script without what only people read. */
+function small(script: string): string {
+  const { code, errors } = minifySync("worker.js", script);
+  if (errors.length) throw new Error(`Spark has changed: ${errors[0]?.message}`);
+  return code;
 }
 
 type Change = readonly [pattern: RegExp, by: (found: string) => string];

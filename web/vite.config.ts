@@ -2,11 +2,12 @@ import { defineConfig } from "vitest/config";
 import { licenses } from "./licenses.ts";
 import { schema } from "./schema.ts";
 import { spark } from "./spark.ts";
+import { three } from "./three.ts";
 
 /** The page of a bundle, which the Python package brings. */
 export default defineConfig({
   base: "./",
-  plugins: [spark(), schema(), licenses()],
+  plugins: [spark(), three(), schema(), licenses()],
   build: {
     outDir: "../src/sagesplat/viewer/static",
     emptyOutDir: true,

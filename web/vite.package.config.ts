@@ -5,6 +5,7 @@ import { defineConfig, type Plugin } from "vite";
 import { licenses } from "./licenses.ts";
 import { schema } from "./schema.ts";
 import { spark } from "./spark.ts";
+import { three } from "./three.ts";
 
 function ownLicense(): Plugin {
   const source = readFileSync(join(import.meta.dirname, "..", "LICENSE"), "utf8");
@@ -18,7 +19,7 @@ function ownLicense(): Plugin {
 
 /** The npm package: one module that brings all that it needs. */
 export default defineConfig({
-  plugins: [spark(true), schema(), licenses(), ownLicense()],
+  plugins: [spark(true), three(), schema(), licenses(), ownLicense()],
   build: {
     outDir: "dist",
     target: "es2022",

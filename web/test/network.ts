@@ -4,7 +4,7 @@ import { gzipSync } from "node:zlib";
 import { inAdvance } from "../src/core/advance";
 import { rotate } from "../src/core/distance";
 import type { Fetch } from "../src/core/download";
-import { loadManifest, parsePromises } from "../src/core/manifest";
+import { loadManifest, parseManifest, parsePromises } from "../src/core/manifest";
 import { Pack } from "../src/core/pack";
 import { ladderOf } from "../src/core/planner";
 import { entriesOf } from "../src/core/residency";
@@ -55,7 +55,7 @@ const cellsOf = ({ labels }: Manifest) => labels.flatMap(({ cells }) => cells);
 function linkTo(documents: Documents, { mbit, connections }: Line) {
   const clock = new VirtualClock();
   const network = new Network(clock, (mbit * 1e6) / 8, LATENCY, connections);
-  const manifest: Manifest = JSON.parse(documents.manifest);
+  const manifest = parseManifest(documents.manifest);
   const put = (uri: string, text: string) => {
     network.files.set(uri, new TextEncoder().encode(text));
     network.packed.set(uri, gzipSync(text).length);
@@ -153,7 +153,7 @@ export async function streamed(
 
 /** SSIM over time if all comes as one file. */
 export function oneFile(documents: Documents, { mbit }: Line): Sample[] {
-  const manifest: Manifest = JSON.parse(documents.manifest);
+  const manifest = parseManifest(documents.manifest);
   const ms = LATENCY + (8 * manifest.totals.bytes) / (mbit * 1000);
   const full = cellsOf(manifest).map(({ levels }) => levels.length);
   const ssim = judge(manifest, documents.promises)(startView(manifest), full);
@@ -163,7 +163,7 @@ export function oneFile(documents: Documents, { mbit }: Line): Sample[] {
 /** SSIM over time if increments come six at a time in the order of the manifest. */
 export async function fileOrder(documents: Documents, line: Line): Promise<Sample[]> {
   const { clock, network } = linkTo(documents, line);
-  const manifest: Manifest = JSON.parse(documents.manifest);
+  const manifest = parseManifest(documents.manifest);
   const ssim = judge(manifest, documents.promises);
   const view = startView(manifest);
   const head = LATENCY + (8 * documents.manifest.length) / (line.mbit * 1000);
@@ -205,7 +205,7 @@ export interface Step {
 /** The capture's cameras in order, one a second. */
 export async function walked(documents: Documents, line: Line, partial: Partial<Settings>): Promise<Step[]> {
   const { clock, network, renderer } = linkTo(documents, line);
-  const manifest: Manifest = JSON.parse(documents.manifest);
+  const manifest = parseManifest(documents.manifest);
   const ssim = judge(manifest, documents.promises);
   const full = cellsOf(manifest).map(({ levels }) => levels.length);
   const settings = { ...FULL, ...partial };

@@ -23,9 +23,9 @@ const [visits, seed, scale] = [values.visits, values.seed, values.scale].map(Num
 const root = fileURLToPath(new URL("..", import.meta.url));
 const { module: sim } = await runnerImport(join(root, "test/visitors.ts"), { root, configFile: false });
 
-const original = JSON.parse(readFileSync(join(bundle, "manifest.json"), "utf8"));
+const original = readFileSync(join(bundle, "manifest.json"), "utf8");
 const manifest = sim.resized(original, scale, !values["no-pack"]);
-const promises = original.promises.fidelity?.uri;
+const promises = manifest.promises.fidelity?.uri;
 
 /** Bytes that a server sends, which packs text and nothing else. */
 const wire = (uri) => {
@@ -58,7 +58,7 @@ const files = [
 const indexOf = new Map(files.map(({ uri }, i) => [uri, i]));
 // text comes unpacked in the simulation: what came of it counts by its share
 const raw = new Map([
-  ["manifest.json", JSON.stringify(manifest).length],
+  ["manifest.json", sim.textOf(manifest).length],
   ...(promises ? [[promises, readFileSync(join(bundle, promises)).length]] : []),
 ]);
 const sent = ({ uri, bytes }) => {

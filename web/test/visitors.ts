@@ -2,7 +2,7 @@
 
 import { rotate } from "../src/core/distance";
 import type { Fetch } from "../src/core/download";
-import { loadManifest } from "../src/core/manifest";
+import { loadManifest, parseManifest } from "../src/core/manifest";
 import { Streamer } from "../src/core/streamer";
 import type { Level, Manifest, Quat, Settings, Vec3, Viewpoint } from "../src/types";
 import { FakeRenderer, Network, putIncrements, rangeOf, seeded, VirtualClock } from "./simulate";
@@ -162,8 +162,9 @@ function recording(network: Network, clock: VirtualClock, log: Request[]): Fetch
   };
 }
 
-/** A manifest whose increments have so many times the bytes; `pack`: whether it keeps its pack. */
-export function resized(manifest: Manifest, scale: number, pack: boolean): Manifest {
+/** A bundle's manifest whose increments have so many times the bytes; `pack`: whether it keeps its pack. */
+export function resized(json: string, scale: number, pack: boolean): Manifest {
+  const manifest = parseManifest(json);
   const resize = (level: Level): Level => ({
     ...level,
     bytes: level.bytes * scale,
@@ -178,12 +179,14 @@ export function resized(manifest: Manifest, scale: number, pack: boolean): Manif
   return { ...manifest, labels, totals, pack: pack ? (stream ?? null) : null };
 }
 
+export const textOf = (manifest: Manifest): string => JSON.stringify(documentOf(manifest));
+
 /** Everything that a manifest names, with the files of the page. */
 function serve(network: Network, manifest: Manifest, files: readonly Served[]): void {
   for (const { uri, wire, text } of files) {
     network.files.set(uri, text === undefined ? new Uint8Array(wire) : new TextEncoder().encode(text));
   }
-  network.files.set("manifest.json", new TextEncoder().encode(JSON.stringify(documentOf(manifest))));
+  network.files.set("manifest.json", new TextEncoder().encode(textOf(manifest)));
   putIncrements(network, manifest);
 }
 

@@ -2,7 +2,7 @@ import { expect, test } from "vitest";
 import type { Camera, Manifest } from "../../src/types";
 import { Network, VirtualClock } from "../simulate";
 import { PROFILES, path, resized, stays, visit } from "../visitors";
-import { bundle } from "../worlds";
+import { bundle, documentOf } from "../worlds";
 
 const camera = (i: number): Camera => ({
   name: `photo-${i}`,
@@ -63,7 +63,7 @@ test("visitors ask for the page, then the manifest, then what the planner wants"
   const came = log.filter(({ uri }) => /^chunks|pack$/.test(uri)).reduce((sum, { bytes }) => sum + bytes, 0);
   expect(came).toBe(manifest.totals.bytes);
   expect(await visit(manifest, files, everything, 20, 1)).toEqual(log);
-  const single = await visit(resized(manifest, 1, false), files, target, 30, 1);
+  const single = await visit(resized(JSON.stringify(documentOf(manifest)), 1, false), files, target, 30, 1);
   const chunks = single.map(({ uri }) => uri).filter((uri) => uri.startsWith("chunks/"));
   expect(chunks.length).toBeGreaterThan(4);
   expect(new Set(chunks).size).toBe(chunks.length);
