@@ -336,8 +336,8 @@ def _camera(entry: CameraEntry, extent: float) -> dict[str, Any]:
     return {
         "name": entry.name,
         "split": entry.split,
-        "position": np.round(frames.position(camera), decimals_of(extent, 5)).tolist(),
-        "quaternion": np.round(frames.quaternion(camera), 6).tolist(),
+        "position": np.round(frames.position(camera), decimals_of(extent, 4)).tolist(),
+        "quaternion": np.round(frames.quaternion(camera), 5).tolist(),
         "fovY": significant(frames.fov_y(camera)),
         "width": camera.width,
         "height": camera.height,
