@@ -132,9 +132,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bundle"
 
 
-def three_walls(folder: Path, label_of: Mapping[int, int] = LABEL_OF, **increments: Any) -> Contents:
+def three_walls(
+    folder: Path, label_of: Mapping[int, int] = LABEL_OF, g: Gaussians | None = None, **increments: Any
+) -> Contents:
     """Each wall is a cell; `label_of`: the category of each."""
-    g = cloud()
+    g = g or cloud()
     chunks = write_increments(folder / "chunks", g, SIZES, NAMES, label_of=label_of, **increments)
     categories = [
         Category(i, name, name.split("-")[0], "#" + bytes(int(255 * c) for c in COLOURS[i]).hex())
@@ -332,6 +334,30 @@ def test_the_picture_is_the_rasterizers(viewer: Opened, made: Path) -> None:
         for k, e in enumerate(levels_in(cell), 1)
     ]
     assert psnr_to(shown, read_increments(made / "chunks", listed)) > 30
+
+
+def test_splats_beside_the_picture_reach_into_it_as_in_training(tmp_path: Path, browser: Any) -> None:
+    """Near and long: projected as at 1.3 half pictures, or they would be stretched over all of it."""
+    g = cloud()
+    beside = torch.tensor([[-1.9, 0.1, 0.8], [1.8, -0.2, 0.7], [0.3, 1.5, 0.9]])
+    rows = [SIZES[1][-1] * i + 15 for i in range(3)]
+    g.means[rows] = beside
+    g.log_scales[rows] = torch.log(torch.tensor([0.9, 0.15, 0.12]))
+    g.quats[rows] = torch.tensor([[1.0, 0, 0, 0], [0.92, 0, 0.38, 0], [0.7, 0, 0.1, 0.7]])
+    contents = three_walls(tmp_path, g=g)
+    write_bundle(tmp_path / "bundle", contents, package_viewer())
+    with (
+        serve(tmp_path / "bundle") as url,
+        open_page(f"{url}?ui=0", browser=browser) as opened,
+    ):
+        ready(opened)
+        full(opened)
+        opened.page.evaluate("sagesplat.goTo('photo1.jpg')")
+        shown = settled(opened)
+    there = read_increments(contents.folder, contents.chunks)
+    ahead = torch.nonzero(there.means[:, 2] > 2)[:, 0]
+    assert psnr_to(shown, there) > 30
+    assert psnr_to(shown, there.select(ahead)) < 20  # without them
 
 
 @pytest.mark.slow

@@ -107,7 +107,9 @@ function levelsDefects({ cells }: documents.Label, i: number): string[] {
       return [
         ...(even ? [] : [`${path} must have a number a level`]),
         ...(sha256.length % bytes.length ? [`${path}.sha256 must have as many digits for each level`] : []),
-        ...(isStream === (offset !== undefined) ? [] : [`${path} must have an offset if it is a stream`]),
+        ...(isStream === (offset !== undefined)
+          ? []
+          : [`${path} must have an offset exactly if it is a stream`]),
         ...(isStream || (bytes.length === 1 && !weights)
           ? []
           : [`${path} must be one level without a weight, as it is a file`]),

@@ -3,6 +3,7 @@ import { BufferAttribute, InstancedBufferGeometry } from "three";
 
 const BATCH = 64; // splats in an instance
 const MARGIN = 1.3; // half pictures from the centre up to which the projection's slope is taken, as in training
+const BLUR = "4.0"; // twice by how many pixels the blur may widen a splat
 const CORNERS = [
   [-1, -1],
   [1, -1],
@@ -46,9 +47,9 @@ export function drawInBatches(spark: SparkRenderer): void {
 }
 
 /**
- * Spark's vertex shader, for batches. As in training, splats outside the picture are stretched no more than at
- * its rim; one larger than the largest square is cut off, where Spark squeezes it. Throws for a shader of another
- * version.
+ * Spark's vertex shader, for batches. As in training, a splat is drawn wherever it reaches into the picture, and
+ * outside of it stretched no more than at its rim; one larger than the largest square is cut off, where Spark
+ * squeezes it. Throws for a shader of another version.
  */
 export function batched(shader: string): string {
   return [
@@ -61,6 +62,14 @@ export function batched(shader: string): string {
     ],
     ["[gl_InstanceID & 3]", "[place & 3]"],
     [
+      "    float clip = clipXY * clipCenter.w;\n    if (abs(clipCenter.x) > clip || abs(clipCenter.y) > clip) {",
+      `    vec2 lens = vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
+    vec2 shift = projectionMatrix[2].xy;
+    float widest = adjustedStdDev * max(scales.x, max(scales.y, scales.z));
+    vec2 reach = widest * sqrt(lens * lens + sqr(${MARGIN} + length(shift))) + ${BLUR} / renderSize * clipCenter.w;
+    if (any(greaterThan(abs(clipCenter.xy) - clipCenter.w, reach))) {`,
+    ],
+    [
       "vRgba.a = rgba.a;",
       `vRgba.a = rgba.a;
     if (encodeLinear) vRgba.rgb = srgbToLinear(vRgba.rgb);
@@ -68,9 +77,7 @@ export function batched(shader: string): string {
     ],
     [
       "vec2 J2 = -(J1 * viewCenter.xy) * invZ;",
-      `vec2 lens = vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
-        vec2 shift = projectionMatrix[2].xy;
-        vec2 J2 = -J1 * clamp(viewCenter.xy * invZ, -(shift + ${MARGIN}) / lens, (${MARGIN} - shift) / lens);`,
+      `vec2 J2 = -J1 * clamp(viewCenter.xy * invZ, -(shift + ${MARGIN}) / lens, (${MARGIN} - shift) / lens);`,
     ],
     [
       "vec2 pixelOffset =",

@@ -82,7 +82,6 @@ export class SparkLayer implements Renderer {
       accumExtSplats: true, // keeps colours above 1 until blending
       minAlpha: 1 / 255, // a contribution below is none, as in training
       maxStdDev: 3.33, // where an opaque splat's alpha falls below that
-      clipXY: 2, // large splats can extend into the image from outside
       maxPixelRadius: 2048,
       preBlurAmount: manifest.antialiased ? 0 : 0.3,
       blurAmount: manifest.antialiased ? 0.3 : 0,

@@ -118,7 +118,7 @@ test.each([
 
 const LEVELS = "labels.0.cells.0.levels";
 const FILLED = "labels[0].cells must have ranges that fill their file, from byte 0 on";
-const KIND = "labels[0].cells[0].levels[0] must have an offset if it is a stream";
+const KIND = "labels[0].cells[0].levels[0] must have an offset exactly if it is a stream";
 const ALONE = "labels[0].cells[0].levels must be one stream, in a file of the label's own";
 const first = streams.labels[0]?.cells[0]?.levels[0];
 
