@@ -112,7 +112,7 @@ function startView(manifest: Manifest): Viewpoint {
 
 /** The page names the pack, which is asked for together with the manifest. */
 function packInAdvance({ manifest }: Documents, { fetch }: Network): Fetch {
-  const { beginning } = new Pack(JSON.parse(manifest));
+  const { beginning } = new Pack(parseManifest(manifest));
   const bytes = beginning.reduce((sum, file) => sum + file.bytes, 0);
   return bytes ? inAdvance(fetch, new URL(beginning[0]?.uri ?? "", BASE).href, bytes).fetch : fetch;
 }
