@@ -72,7 +72,7 @@ def test_quick_lines_run_in_their_order(finished_run, tmp_path, monkeypatch, cap
     assert "budget" in (tmp_path / "runs/demo/nested/plan.json").read_text()
     assert len(read_spz(Path("small.spz"))) > 0
     assert Path("site/index.html").is_file()
-    assert Path("courtyard.html").stat().st_size > 1e6
+    assert Path("courtyard.html").stat().st_size > 8e5  # the viewer has most of it
     capsys.readouterr()
 
 
