@@ -110,11 +110,15 @@ function startView(manifest: Manifest): Viewpoint {
   return { position, direction, frustum: frustumOf(position, quaternion, 0.9, 1.6), lens: lensOf(0.9, 1.6) };
 }
 
-/** The page names the pack, which is asked for together with the manifest. */
-function packInAdvance({ manifest }: Documents, { fetch }: Network): Fetch {
-  const { beginning } = new Pack(parseManifest(manifest));
+/** The page names the pack and the promises, which are asked for together with the manifest. */
+function namedInAdvance({ manifest }: Documents, { fetch }: Network): Fetch {
+  const found = parseManifest(manifest);
+  const { beginning } = new Pack(found);
   const bytes = beginning.reduce((sum, file) => sum + file.bytes, 0);
-  return bytes ? inAdvance(fetch, new URL(beginning[0]?.uri ?? "", BASE).href, bytes).fetch : fetch;
+  const url = (uri = "") => new URL(uri, BASE).href;
+  const pack = bytes ? inAdvance(fetch, url(beginning[0]?.uri), bytes).fetch : fetch;
+  const { fidelity } = found.promises;
+  return fidelity ? inAdvance(pack, url(fidelity.uri)).fetch : pack;
 }
 
 /** SSIM over time of the streamer, which fetches everything in the end or what a target asks for. */
@@ -124,7 +128,7 @@ export async function streamed(
   partial: Partial<Settings>,
 ): Promise<Sample[]> {
   const { clock, network, renderer } = linkTo(documents, line);
-  const fetch = packInAdvance(documents, network);
+  const fetch = namedInAdvance(documents, network);
   const head = documents.manifest.length;
   const curve: Sample[] = [NOTHING];
   const streamers = loadManifest(BASE, fetch).then((manifest) => {

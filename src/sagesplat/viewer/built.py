@@ -1,6 +1,7 @@
 """The built viewer of this package: its folder and its page."""
 
 import re
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -26,7 +27,7 @@ def has_viewer(folder: Path, viewer: Path) -> bool:
     pages = [path / PAGE for path in (folder, viewer)]
     if not all(page.is_file() for page in pages):
         return False
-    mine, page = (with_pack(page.read_text(encoding="utf-8"), None) for page in pages)
+    mine, page = (with_pack(page.read_text(encoding="utf-8")) for page in pages)
     return mine in (page, with_poster(page))
 
 
@@ -35,7 +36,7 @@ def with_poster(page: str) -> str:
     return page.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />')
 
 
-def with_pack(page: str, named: tuple[str, int] | None) -> str:
-    """The page with the name of the bundle's pack, and how many bytes of it to ask for with the manifest."""
-    tag = "<!-- pack -->" if named is None else f'<meta name="pack" content="{named[0]} {named[1]}" />'
+def with_pack(page: str, named: Sequence[str] = ()) -> str:
+    """The page with what to ask for with the manifest: the pack, how many bytes of it, and maybe promises."""
+    tag = f'<meta name="pack" content="{" ".join(named)}" />' if named else "<!-- pack -->"
     return _PACK.sub(lambda _: tag, page, count=1)

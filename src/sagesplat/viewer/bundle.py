@@ -7,11 +7,12 @@ describe them (`viewer.manifest`). The same contents give the same bytes.
 import hashlib
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from sagesplat.core.errors import DataError, RunError
 from sagesplat.formats.increments import STREAM
@@ -82,10 +83,12 @@ def _put_up(folder: Path, poster: bytes) -> None:
     write_text(page, with_poster(page.read_text(encoding="utf-8")))
 
 
-def _name_pack(page: Path, uri: str, beginning: int) -> None:
-    """Name the pack in the page, so that no round trip passes before these bytes of it are asked for."""
+def _name_files(page: Path, manifest: Mapping[str, Any]) -> None:
+    """Name in the page what is asked for with the manifest: the first levels, and the target's promises."""
+    promises = manifest["promises"].get(manifest["target"]["quality"])
+    named = manifest["pack"]["uri"], str(beginning_of(manifest)), *([promises["uri"]] if promises else [])
     if page.is_file():
-        write_text(page, with_pack(page.read_text(encoding="utf-8"), (uri, beginning)))
+        write_text(page, with_pack(page.read_text(encoding="utf-8"), named))
 
 
 def write_documents(folder: Path, contents: Contents) -> BundleSizes:
@@ -93,7 +96,7 @@ def write_documents(folder: Path, contents: Contents) -> BundleSizes:
     manifest, promises = documents(contents, (folder / THIRD_PARTY).exists())
     if contents.chunks and not contents.live:
         manifest["pack"] = write_pack(folder, manifest["labels"], pack_order(contents))
-        _name_pack(folder / PAGE, manifest["pack"]["uri"], beginning_of(manifest))
+        _name_files(folder / PAGE, manifest)
     for quality, content in promises.items():
         (folder / manifest["promises"][quality]["uri"]).write_bytes(content)
     write_text(folder / SCHEMA, files("sagesplat.viewer").joinpath(SCHEMA).read_text(encoding="utf-8"))
