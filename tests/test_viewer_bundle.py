@@ -482,7 +482,8 @@ def test_the_page_names_the_pack(tmp_path, contents, viewer) -> None:
         levels = {c["id"]: c["levels"] for label in manifest_of(out)["labels"] for c in label["cells"]}
         first = sum(levels[cell][0]["bytes"][0] for cell, level in pack["order"] if level == 1)
         page, promises = (out / "index.html").read_text(), manifest_of(out)["promises"]["fidelity"]["uri"]
-        assert page == f'<head><meta name="pack" content="{pack["uri"]} {first} {promises}" /></head>'
+        named = f'<meta name="pack" content="{pack["uri"]} {first}" />'
+        assert page == f'<head>{named}<link rel="preload" href="{promises}" as="fetch" crossorigin /></head>'
         assert has_viewer(out, viewer)
         write_documents(out, contents)  # names it anew
 

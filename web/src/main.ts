@@ -33,16 +33,15 @@ async function begin(): Promise<void> {
   } else await showOnline(app, options);
 }
 
-/** Shows a bundle of a server. The pack and promises that the page names are asked for together with the manifest. */
+/** Shows a bundle of a server. The pack that the page names is asked for together with the manifest. */
 async function showOnline(app: HTMLElement, options: Options): Promise<void> {
   const base = bundleUrl(options.bundle, location.href);
   const online: Fetch = (url, init) => fetch(url, init);
-  const named = options.bundle ? null : filesNamed(document);
+  const named = options.bundle ? null : packNamed(document);
   if (!named) return show(app, { base, fetch: online }, options);
   const pack = inAdvance(online, new URL(named.uri, base).href, named.bytes);
-  const { fetch } = named.promises ? inAdvance(pack.fetch, new URL(named.promises, base).href) : pack;
   try {
-    await show(app, { base, fetch }, options);
+    await show(app, { base, fetch: pack.fetch }, options);
   } finally {
     pack.cancel(); // an older page names an older pack; a broken bundle needs none
   }
@@ -70,12 +69,11 @@ async function show(app: HTMLElement, source: Source, options: Options): Promise
   removePosterWhenDrawn(viewer, canvas);
 }
 
-/** What the page of a bundle names: its pack, what every plan wants of it, and the promises for its target. */
-function filesNamed(page: ParentNode): { uri: string; bytes: number; promises?: string | undefined } | null {
+/** The pack that the page of a bundle names, and what every plan wants of it: asked for together with the manifest. */
+function packNamed(page: ParentNode): { uri: string; bytes: number } | null {
   const content = page.querySelector<HTMLMetaElement>('meta[name="pack"]')?.content ?? "";
-  const named = /^(\w[\w-]*\.pack) ([1-9]\d*)(?: (promises-\w+\.json))?$/.exec(content);
-  const [, uri, bytes, promises] = named ?? [];
-  return uri ? { uri, bytes: Number(bytes), promises } : null;
+  const [, uri, bytes] = /^(\w[\w-]*\.pack) ([1-9]\d*)$/.exec(content) ?? [];
+  return uri ? { uri, bytes: Number(bytes) } : null;
 }
 
 /** Removes the poster when the scene is drawn, or at the first input. */

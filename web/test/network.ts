@@ -110,7 +110,7 @@ function startView(manifest: Manifest): Viewpoint {
   return { position, direction, frustum: frustumOf(position, quaternion, 0.9, 1.6), lens: lensOf(0.9, 1.6) };
 }
 
-/** The page names the pack and the promises, which are asked for together with the manifest. */
+/** The page names the pack and the promises, which a browser asks for together with the manifest. */
 function namedInAdvance({ manifest }: Documents, { fetch }: Network): Fetch {
   const found = parseManifest(manifest);
   const { beginning } = new Pack(found);
@@ -118,7 +118,8 @@ function namedInAdvance({ manifest }: Documents, { fetch }: Network): Fetch {
   const url = (uri = "") => new URL(uri, BASE).href;
   const pack = bytes ? inAdvance(fetch, url(beginning[0]?.uri), bytes).fetch : fetch;
   const { fidelity } = found.promises;
-  return fidelity ? inAdvance(pack, url(fidelity.uri)).fetch : pack;
+  const early = fidelity && fetch(url(fidelity.uri));
+  return (asked, init) => (early && asked === url(fidelity.uri) ? early : pack(asked, init));
 }
 
 /** SSIM over time of the streamer, which fetches everything in the end or what a target asks for. */

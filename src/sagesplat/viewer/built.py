@@ -1,14 +1,13 @@
 """The built viewer of this package: its folder and its page."""
 
 import re
-from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
 from sagesplat.core.errors import SageError
 
 PAGE, POSTER = "index.html", "poster.jpg"
-_PACK = re.compile(r'<!-- pack -->|<meta name="pack" content="[^"]*" />')
+_NAMED = re.compile(r'<!-- pack -->|<meta name="pack" content="[^"]*" />(<link rel="preload" [^>]*>)?')
 
 
 def package_viewer() -> Path:
@@ -27,7 +26,7 @@ def has_viewer(folder: Path, viewer: Path) -> bool:
     pages = [path / PAGE for path in (folder, viewer)]
     if not all(page.is_file() for page in pages):
         return False
-    mine, page = (with_pack(page.read_text(encoding="utf-8")) for page in pages)
+    mine, page = (with_files(page.read_text(encoding="utf-8"), None) for page in pages)
     return mine in (page, with_poster(page))
 
 
@@ -36,7 +35,9 @@ def with_poster(page: str) -> str:
     return page.replace("<!-- poster -->", f'<img id="poster" src="{POSTER}" alt="" />')
 
 
-def with_pack(page: str, named: Sequence[str] = ()) -> str:
-    """The page with what to ask for with the manifest: the pack, how many bytes of it, and maybe promises."""
-    tag = f'<meta name="pack" content="{" ".join(named)}" />' if named else "<!-- pack -->"
-    return _PACK.sub(lambda _: tag, page, count=1)
+def with_files(page: str, pack: tuple[str, int] | None, promises: str | None = None) -> str:
+    """The page with what is asked for with the manifest: so many bytes of the pack, and promises."""
+    tag = "<!-- pack -->" if pack is None else f'<meta name="pack" content="{pack[0]} {pack[1]}" />'
+    if pack and promises:
+        tag += f'<link rel="preload" href="{promises}" as="fetch" crossorigin />'
+    return _NAMED.sub(lambda _: tag, page, count=1)

@@ -19,7 +19,7 @@ from sagesplat.formats.increments import STREAM
 from sagesplat.formats.stream import end_of_palette
 from sagesplat.io.files import atomic_folder, unwritable, write_text
 from sagesplat.io.typed import known_json
-from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_pack, with_poster
+from sagesplat.viewer.built import PAGE, POSTER, check_viewer, with_files, with_poster
 from sagesplat.viewer.manifest import FORMAT, LOOKS, THIRD_PARTY, Contents, documents, pack_order
 from sagesplat.viewer.pack import beginning_of, write_pack
 from sagesplat.viewer.quality import dumped
@@ -86,9 +86,10 @@ def _put_up(folder: Path, poster: bytes) -> None:
 def _name_files(page: Path, manifest: Mapping[str, Any]) -> None:
     """Name in the page what is asked for with the manifest: the first levels, and the target's promises."""
     promises = manifest["promises"].get(manifest["target"]["quality"])
-    named = manifest["pack"]["uri"], str(beginning_of(manifest)), *([promises["uri"]] if promises else [])
+    pack = manifest["pack"]["uri"], beginning_of(manifest)
     if page.is_file():
-        write_text(page, with_pack(page.read_text(encoding="utf-8"), named))
+        text = page.read_text(encoding="utf-8")
+        write_text(page, with_files(text, pack, promises and promises["uri"]))
 
 
 def write_documents(folder: Path, contents: Contents) -> BundleSizes:

@@ -10,18 +10,18 @@ export interface Advance {
 }
 
 /**
- * Asks for a file, or its beginning, at once; who asks for the same first gets that answer.
+ * Asks for the beginning of a file at once; who asks for it first gets that answer.
  *
- * @param bytes - of the beginning
+ * @param bytes - of it
  */
-export function inAdvance(fetch: Fetch, url: string, bytes?: number): Advance {
+export function inAdvance(fetch: Fetch, url: string, bytes: number): Advance {
   const abort = new AbortController();
-  const headers: Record<string, string> = bytes ? { Range: `bytes=0-${bytes - 1}` } : {};
+  const headers = { Range: `bytes=0-${bytes - 1}` };
   let early: ReturnType<Fetch> | null = fetch(url, { signal: abort.signal, headers });
   early.catch(() => {}); // who takes it asks again
   return {
     fetch: async (asked, init) => {
-      const isSame = asked === url && new Headers(init?.headers).get("Range") === (headers.Range ?? null);
+      const isSame = asked === url && new Headers(init?.headers).get("Range") === headers.Range;
       if (!isSame || !early || init?.cache) return fetch(asked, init);
       const answer = early;
       early = null;

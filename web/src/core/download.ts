@@ -122,7 +122,7 @@ export async function receive(
       ...(again && { cache: "reload" as const }),
       ...(range && { headers: { Range: `bytes=${range.start}-${range.end - 1}` } }),
     });
-    if (!reply.isEarly) link.answered(clock.now() - asked);
+    if (range && !reply.isEarly) link.answered(clock.now() - asked); // a page may have preloaded others
     if (!reply.ok) throw refused(file, reply.status);
     check?.(reply);
     await each(reply, (part) => {

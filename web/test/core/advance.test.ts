@@ -36,21 +36,6 @@ test("who asks first gets the answer that is on its way, others their own", asyn
   expect(network.asked).toEqual(["a.pack", "a.pack"]);
 });
 
-test("a whole file, of which a part is asked for by itself", async () => {
-  const { clock, network } = made();
-  network.asked.length = 0;
-  const advance = inAdvance(network.fetch, url("a.pack"));
-  const texts: string[] = [];
-  for (const init of [BEGINNING, {}]) {
-    void advance.fetch(url("a.pack"), init).then(async (reply) => {
-      texts.push(`${await reply.text()}${reply.isEarly ?? false}`);
-    });
-  }
-  await clock.pass(300);
-  expect(texts.sort()).toEqual(["\x01\x02\x03true", "\x01\x02false"]);
-  expect(network.asked).toEqual(["a.pack", "a.pack"]);
-});
-
 test.each<["offline" | 404]>([["offline"], [404]])(
   "an early answer of %s is asked for again",
   async (fault) => {
