@@ -94,6 +94,7 @@ export interface Range {
 export interface ReceiveOptions {
   readonly range?: Range; // all that is asked for
   readonly again?: boolean; // bypasses the browser's cache
+  readonly besides?: boolean; // other ranges of the file are on their way: Chromium's cache would wait for each
   readonly silence?: number | undefined; // ms without data after which the download counts as failed
   readonly check?: (reply: Reply) => void; // throws for an unusable response
 }
@@ -103,7 +104,7 @@ export async function receive(
   link: Link,
   file: File,
   signal: AbortController,
-  { again = false, silence = SILENCE, check, range }: ReceiveOptions,
+  { again = false, besides = false, silence = SILENCE, check, range }: ReceiveOptions,
   take: (part: Uint8Array) => boolean,
 ): Promise<void> {
   const { fetch, clock } = link; // the browser's fetch must not be called as a method
@@ -119,6 +120,7 @@ export async function receive(
     const asked = clock.now();
     const reply = await fetch(url, {
       signal: signal.signal,
+      ...(besides && { cache: "no-store" as const }),
       ...(again && { cache: "reload" as const }),
       ...(range && { headers: { Range: `bytes=${range.start}-${range.end - 1}` } }),
     });

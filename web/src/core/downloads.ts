@@ -254,6 +254,7 @@ export class Downloads {
   private async runRanges(load: Load, files: readonly File[], again: boolean): Promise<void> {
     const { isPack } = load;
     const all = (isPack ? this.pack?.files : this.ranges.get((files[0] as File).uri)) ?? files;
+    const others = [...this.loads.all].filter((one) => one !== load);
     const came = (file: File, then: () => void) => {
       if (load.dropped || (!this.loads.came(load, file) && this.isHere(file))) return;
       then();
@@ -262,6 +263,7 @@ export class Downloads {
     await downloadRanges(this.link, files, all, {
       abort: load.abort,
       again,
+      besides: others.some((one) => one.files[0]?.uri === files[0]?.uri),
       silence: isPack ? PACK_SILENCE : undefined,
       answered: (ranges) => {
         this.sendsRanges = ranges;

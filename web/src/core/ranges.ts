@@ -58,7 +58,7 @@ export async function downloadRanges(
   link: Link,
   wanted: readonly File[],
   all: readonly File[],
-  { abort, again, silence, answered, take, corrupt, progress }: Ranges,
+  { abort, again, besides, silence, answered, take, corrupt, progress }: Ranges,
 ): Promise<void> {
   const [first, last] = [wanted[0] as File, wanted.at(-1) as File];
   const start = first.offset ?? 0;
@@ -75,7 +75,7 @@ export async function downloadRanges(
     name = first.uri;
     cutter = new Cutter(all, cut);
   };
-  await receive(link, first, abort, { again, check, range, silence }, (part) => {
+  await receive(link, first, abort, { again, besides, check, range, silence }, (part) => {
     cutter.add(part);
     progress(cutter.taken);
     return cutter.taken <= cutter.size;
@@ -91,6 +91,7 @@ export async function downloadRanges(
 export interface Ranges {
   readonly abort: AbortController;
   readonly again: boolean; // bypasses the browser's cache
+  readonly besides: boolean; // other ranges of the file are on their way
   readonly silence: number | undefined; // ms without data after which it counts as failed
   readonly answered: (ranges: boolean) => void; // whether only what was asked for comes
   /** Called for every range that is intact, in their order. */

@@ -1,6 +1,7 @@
 /** Levels that are ranges of a file: asked for in one request where they touch, checked one by one. */
 
 import { describe, expect, test } from "vitest";
+import type { Fetch } from "../../src/core/download";
 import type { Fault } from "../simulate";
 import { shown, wanted, world } from "../world";
 import { NO_BUDGET, type Options } from "../worlds";
@@ -19,6 +20,22 @@ test("every level comes once, in fewer requests than levels", async () => {
   expect(shown(w.streamer.state)).toEqual([12, 12, 12]);
   expect(w.streamer.state).toMatchObject({ bytesLoaded: total, message: null });
   expect(w.network.askedRanges.length).toBeLessThan(20);
+});
+
+test("ranges that come beside others of their file do not wait in the browser's cache", async () => {
+  const { w } = made({ labels: 2, cells: 8, levels: 6 });
+  const caches = new Map<string, (string | undefined)[]>();
+  const fetch: Fetch = (url, init) => {
+    if (init?.headers) caches.set(url, [...(caches.get(url) ?? []), init.cache]);
+    return w.network.fetch(url, init);
+  };
+  const other = world({}, { manifest: w.manifest, fetch }, w);
+  await other.run({ mode: "base" });
+  expect(caches.size).toBe(2);
+  for (const all of caches.values()) {
+    expect(all[0]).toBeUndefined();
+    expect(all).toContain("no-store");
+  }
 });
 
 test("levels of one request are drawn as they come", async () => {
