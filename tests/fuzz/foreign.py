@@ -79,7 +79,7 @@ EXCEPTIONS: dict[str, str] = {
     "studies.compare.run:compare": _HASHED,
     "train.memory:_cgroup_limits": MACHINE,
     "stages.view:_ladder_of": "a manifest that view.is_bundle has read",
-    "viewer.bundle:_name_pack": OURS,
+    "viewer.bundle:_name_files": OURS,
     "viewer.bundle:_put_up": OURS,
     "viewer.built:has_viewer": OURS,
     "viewer.bundle:verified_files": _HASHED,
