@@ -17,6 +17,7 @@ from conftest import random_gaussians
 from PIL import Image
 
 from sagesplat import read_ply, read_splat
+from sagesplat.viewer.built import package_viewer
 from tools.notebooks import NOTEBOOKS, execute
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -112,7 +113,8 @@ def test_the_notebook_of_a_first_scene(tmp_path, monkeypatch):
     execute(first, SIZES)
     assert "train: " in printed(first)
     assert len(read_ply(Path("planned.ply"))) > 0
-    assert Path("scene.html").stat().st_size > 8e5
+    scripts = sum(path.stat().st_size for path in package_viewer().glob("assets/*.js"))
+    assert Path("scene.html").stat().st_size > scripts > 5e5  # the scene is in it too
 
 
 @pytest.mark.slow

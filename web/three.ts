@@ -4,7 +4,7 @@ const SHADER = /^((?:var|const) [\w$]+ = )"((?:[^"\\]|\\.)*)";$/gm;
 // by Spark's shaders, and by what three.js puts before all shaders
 const IS_USED = /^var (?:logdepthbuf_\w+|(?:colorspace|tonemapping)_pars_fragment) = /;
 
-/** three.js without the shaders of its own materials, an eighth of the script: splats have their own. */
+/** three.js without the shaders of its own materials, a tenth of the script: splats have their own. */
 export function three(): Plugin {
   return {
     name: "three-without-shaders",

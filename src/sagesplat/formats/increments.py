@@ -34,8 +34,8 @@ FileFormat = Literal["spz", "ply"]  # of a file that is one increment
 Format = Literal["stream", "spz", "ply"]
 Refine = Literal["ADD", "REPLACE"]
 INDEX = "index.json"
-# of hashes in a manifest, whose longest part they are: 48 bits of a file; 16 of a range, as a damaged stream
-# hardly ever ends in the coder's first state, but for bits that are not modelled
+# of hashes in a manifest: 48 bits of a file; 16 of a range, as decoding tells most damage of a stream, but
+# not that of bits without a model
 DIGITS = 12
 DIGITS_OF_RANGE = 4
 STREAM = ".sgst"

@@ -1,4 +1,4 @@
-"""Lists of whole numbers in a document, coded as a stream's columns are: half the bytes that gzip needs.
+"""Lists of whole numbers in a document, coded as a stream's columns are: 0.7 of the bytes of gzip.
 
 `packed` replaces each list by its length, and puts all of them into `numbers`, in base64. docs/formats.md
 specifies the bytes, `web/src/core/numbers.ts` reads them.

@@ -133,8 +133,12 @@ export class Downloads {
 
   /** Whether a range may come with one that was asked for: from a server without ranges. */
   private mayComeWhole({ uri, offset }: File): boolean {
-    if (offset === undefined || this.sendsRanges !== null) return false;
-    return [...this.loads.all].some(({ files }) => files[0]?.uri === uri);
+    return offset !== undefined && this.sendsRanges === null && this.isAsked(uri);
+  }
+
+  /** Whether a request for a file is on its way, besides one of them. */
+  private isAsked(uri: string | undefined, besides?: Load): boolean {
+    return [...this.loads.all].some((one) => one !== besides && one.files[0]?.uri === uri);
   }
 
   /** What is asked for together with a file: of ranges those that touch, of a server without ranges all. */
@@ -254,7 +258,6 @@ export class Downloads {
   private async runRanges(load: Load, files: readonly File[], again: boolean): Promise<void> {
     const { isPack } = load;
     const all = (isPack ? this.pack?.files : this.ranges.get((files[0] as File).uri)) ?? files;
-    const others = [...this.loads.all].filter((one) => one !== load);
     const came = (file: File, then: () => void) => {
       if (load.dropped || (!this.loads.came(load, file) && this.isHere(file))) return;
       then();
@@ -263,7 +266,7 @@ export class Downloads {
     await downloadRanges(this.link, files, all, {
       abort: load.abort,
       again,
-      besides: others.some((one) => one.files[0]?.uri === files[0]?.uri),
+      besides: this.isAsked(files[0]?.uri, load),
       silence: isPack ? PACK_SILENCE : undefined,
       answered: (ranges) => {
         this.sendsRanges = ranges;
