@@ -5,6 +5,7 @@ import { grow } from "../core/grow";
 import { type Packed, type Picked, pick } from "../core/pick";
 import type { Streamer } from "../core/streamer";
 import type { Cell, Label, Manifest, Settings } from "../types";
+import { ENCODING } from "./packing";
 import { Mark } from "./spark";
 import type { Stage } from "./stage";
 
@@ -199,7 +200,6 @@ export class Editor {
   }
 
   private meet(x: number, y: number): Picked | null {
-    const { layer } = this.viewer.stage;
     const ray = this.viewer.stage.ray(x, y);
     const clouds = [...this.labels.values()].flatMap((label) =>
       placed(label).flatMap(({ cell, first }) => {
@@ -207,8 +207,7 @@ export class Editor {
         return cloud ? { ...cloud, first } : [];
       }),
     );
-    const some = this.labels.get(clouds[0]?.label ?? 0)?.cells[0];
-    return pick(clouds, layer.encodingOf(some?.id ?? 0), ray);
+    return pick(clouds, ENCODING, ray);
   }
 
   /** The shown splats of a cell; null where they are merged ones, which have no ranks. */
@@ -270,7 +269,7 @@ export class Editor {
       end += own.length;
     }
     const cloud: Packed = { label: seed.label, words, count };
-    return grow(cloud, layer.encodingOf(cells[0]?.id ?? 0), seed.rank, tolerance, among);
+    return grow(cloud, ENCODING, seed.rank, tolerance, among);
   }
 
   private masksOf(isIn: (owner: number) => boolean): Map<number, Uint8Array> {

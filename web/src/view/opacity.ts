@@ -25,7 +25,7 @@ function logit(byte: number): number {
 }
 
 /** Enters the second opacities that have come with a later part. */
-function enterEarlier(parts: readonly Part[]): void {
+export function enterEarlier(parts: readonly Part[]): void {
   parts.forEach(({ earlier }, i) => {
     let end = earlier?.length ?? 0;
     for (let k = i - 1; k >= 0 && end > 0; k--) {
@@ -39,16 +39,12 @@ function enterEarlier(parts: readonly Part[]): void {
   });
 }
 
-/** Sets the opacities of parts, which lie one after the other in `words`, for a weight of the second ones. */
-export function blendOpacities(words: Uint32Array, parts: readonly Part[], weight: number): void {
+/** Sets the opacities in a part's words, for a weight of the second ones. */
+export function blendOpacities(words: Uint32Array, { count, opacities }: Part, weight: number): void {
+  if (!opacities) return;
   const blend = new Blend(weight);
-  enterEarlier(parts);
-  let start = 0;
-  for (const { count, opacities } of parts) {
-    for (let i = 0, at = 4 * start; opacities && i < count; i++, at += 4) {
-      const opacity = blend.at(opacities[2 * i] as number, opacities[2 * i + 1] as number);
-      words[at] = ((words[at] as number) & 0xffffff) | (opacity << 24);
-    }
-    start += count;
+  for (let i = 0, at = 0; i < count; i++, at += 4) {
+    const opacity = blend.at(opacities[2 * i] as number, opacities[2 * i + 1] as number);
+    words[at] = ((words[at] as number) & 0xffffff) | (opacity << 24);
   }
 }

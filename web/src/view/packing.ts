@@ -8,10 +8,10 @@ import type { Sink } from "../core/stream";
 export const HARMONICS = ["sh1", "sh2", "sh3"] as const;
 export const WORDS = { sh1: 2, sh2: 4, sh3: 4 } as const; // uint32 words per splat
 
-/** The full range of SPZ: colours below 0 and above 1 can become visible with the harmonics. */
+/** Streams do not limit colours, and these hold hardly any beyond. Their own steps are 1.5 times as wide as these. */
 export const ENCODING = {
-  rgbMin: -0.45,
-  rgbMax: 1.45,
+  rgbMin: -0.5,
+  rgbMax: 2,
   lnScaleMin: -12,
   lnScaleMax: 9,
   sh1Max: 1,
@@ -20,13 +20,9 @@ export const ENCODING = {
   lodOpacity: false,
 };
 
-/** Streams do not limit colours; beyond this there are hardly any. Their own steps are 1.5 times as wide as these. */
-export const STREAM_ENCODING = { ...ENCODING, rgbMin: -0.5, rgbMax: 2 };
-
 /** A decoded increment in main memory: Spark's packed encoding, trimmed to `count` splats. */
 export interface Part {
   readonly count: number;
-  readonly encoding: typeof ENCODING;
   readonly splats: Uint32Array; // [count, 4]
   readonly harmonics: ReadonlyMap<(typeof HARMONICS)[number], Uint32Array>;
   readonly opacities: Uint8Array | null; // [count, 2] in 1/255: the first and the second one, if there are two
@@ -76,7 +72,7 @@ export class Packing implements Sink<Part> {
     );
     const opacities = header.twoOpacities ? new Uint8Array(2 * count) : null;
     const splats = new Uint32Array(4 * count);
-    const part = { count, encoding: STREAM_ENCODING, splats, harmonics: new Map(harmonics), opacities };
+    const part = { count, splats, harmonics: new Map(harmonics), opacities };
     return deferred ? { ...part, earlier: new Uint8Array(deferred) } : part;
   }
 
@@ -240,13 +236,13 @@ function putHarmonics(
 function scaleByte(log: number): number {
   const within = Math.max(-LONGEST_LOG, Math.min(log, LONGEST_LOG));
   if (within < NO_SCALE) return 0;
-  const { lnScaleMin, lnScaleMax } = STREAM_ENCODING;
+  const { lnScaleMin, lnScaleMax } = ENCODING;
   const steps = Math.round(((within - lnScaleMin) * 254) / (lnScaleMax - lnScaleMin)) + 1;
   return Math.max(1, Math.min(steps, 255));
 }
 
 function colourByte(sh0: number): number {
-  const { rgbMin, rgbMax } = STREAM_ENCODING;
+  const { rgbMin, rgbMax } = ENCODING;
   const share = (sh0 * SH_C0 + 0.5 - rgbMin) / (rgbMax - rgbMin);
   return Math.max(0, Math.min(255, Math.round(share * 255)));
 }

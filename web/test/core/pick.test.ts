@@ -2,7 +2,9 @@ import { describe, expect, it } from "vitest";
 import { grow } from "../../src/core/grow";
 import { type Packed, pick, positionOf, type Ray } from "../../src/core/pick";
 import type { Vec3 } from "../../src/types";
-import { ENCODING } from "../../src/view/packing";
+import { ENCODING as STREAMS } from "../../src/view/packing";
+
+const ENCODING = { ...STREAMS, rgbMin: -0.45, rgbMax: 1.45 };
 
 interface Splat {
   readonly at: Vec3;

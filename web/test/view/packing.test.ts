@@ -4,7 +4,7 @@ import { utils } from "@sparkjsdev/spark";
 import { describe, expect, test } from "vitest";
 import { BASES } from "../../src/core/columns";
 import { StreamDecoder } from "../../src/core/stream";
-import { STREAM_ENCODING as ENCODING, HARMONICS, Packing, WORDS } from "../../src/view/packing";
+import { ENCODING, HARMONICS, Packing, WORDS } from "../../src/view/packing";
 import { Floats, type Gaussians } from "../floats";
 import { bytesOf, golden, paletteOf } from "../golden";
 
