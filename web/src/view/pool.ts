@@ -88,11 +88,13 @@ export class Pool implements Source {
     this.#added.clear();
   }
 
-  /** Forgets a part. What is drawn has to be set anew. */
-  remove(part: Part): void {
+  /** Forgets a part. Whether others have moved, so that what is drawn has to be set anew. */
+  remove(part: Part): boolean {
     this.#starts.delete(part);
     const parts = [...this.#starts.keys()];
-    if (WASTE * Math.max(ROW, total(parts)) < this.splats.maxSplats) this.#move(parts);
+    const isWasteful = WASTE * Math.max(ROW, total(parts)) < this.splats.maxSplats;
+    if (isWasteful) this.#move(parts);
+    return isWasteful;
   }
 
   /** Writes the words that a part is drawn with: those it came with, changed by `change`. */

@@ -22,7 +22,6 @@ interface Increment extends Handle {
 /** The increments of a cell. */
 interface Column {
   readonly label: number;
-  color: number; // 0xrrggbb
   shown: readonly Increment[]; // by level
   bounds: Box | null; // of what is shown
   drawn: boolean; // in sight, or nearly
@@ -42,7 +41,8 @@ export class SparkLayer implements Renderer {
   readonly scene = new Scene();
   readonly root = new Group();
   readonly spark: SparkRenderer;
-  readonly #columns: ReadonlyMap<number, Column>; // by cell; splats of equal depth are drawn in their order
+  readonly #columns = new Map<number, Column>(); // by cell; splats of equal depth are drawn in their order
+  readonly #colors = new Map<number, string>(); // by cell
   readonly #hidden = new Set<number>(); // labels
   readonly #weights: ReadonlyMap<number, readonly (number | undefined)[]>; // of second opacities, by cell and level
   readonly #decoders = new Decoders(startWorker, workers());
@@ -69,7 +69,6 @@ export class SparkLayer implements Renderer {
     drawInBatches(this.spark);
     const cells = manifest.labels.flatMap((label) => label.cells.map((cell) => ({ label: label.id, cell })));
     this.#weights = new Map(cells.map(({ cell }) => [cell.id, cell.levels.map((one) => one.weight)]));
-    this.#columns = new Map(cells.map(({ label, cell }) => [cell.id, emptyColumn(label)]));
     this.#pool = new Pool(renderer, this.#tint, () => this.#mesh.updateGenerator());
     this.#mesh = new SplatMesh({
       splats: this.#pool,
@@ -79,6 +78,7 @@ export class SparkLayer implements Renderer {
     this.root.add(this.#mesh);
     this.place(rootMatrix(manifest.frame));
     this.scene.add(this.spark, this.root);
+    for (const { label, cell } of cells) this.#column(label, cell.id);
     this.setColors(colorsOf(manifest));
   }
 
@@ -107,10 +107,7 @@ export class SparkLayer implements Renderer {
 
   /** Colours (#rrggbb) by cell. */
   setColors(colors: ReadonlyMap<number, string>): void {
-    for (const [cell, column] of this.#columns) {
-      const color = colors.get(cell);
-      if (color) column.color = Number.parseInt(color.slice(1), 16);
-    }
+    for (const [cell, color] of colors) this.#colors.set(cell, color);
     this.#draw();
   }
 
@@ -134,9 +131,9 @@ export class SparkLayer implements Renderer {
   swap(show: readonly Handle[], hide: readonly Handle[]): void {
     const added = show as readonly Increment[];
     this.#pool.add(added.map(({ part }) => part));
-    for (const cell of new Set([...show, ...hide].map((handle) => handle.cell))) {
-      const column = this.#columns.get(cell);
-      if (!column) continue;
+    const labels = new Map([...show, ...hide].map(({ cell, label }) => [cell, label]));
+    for (const [cell, label] of labels) {
+      const column = this.#column(label, cell);
       const own = added.filter((handle) => handle.cell === cell);
       const kept = column.shown.filter((part) => !hide.includes(part) && !own.includes(part));
       column.shown = [...kept, ...own].sort((a, b) => a.level - b.level);
@@ -147,10 +144,11 @@ export class SparkLayer implements Renderer {
   }
 
   dispose(handle: Handle): void {
+    const increment = handle as Increment;
     const column = this.#columns.get(handle.cell);
-    if (column) column.shown = column.shown.filter((part) => part !== handle);
-    this.#pool.remove((handle as Increment).part);
-    this.#draw();
+    const isShown = column?.shown.includes(increment) ?? false;
+    if (column && isShown) column.shown = column.shown.filter((one) => one !== increment);
+    if (this.#pool.remove(increment.part) || isShown) this.#draw();
   }
 
   /** Leaves out the cells that are far from what a viewpoint sees; to be called before each frame. */
@@ -229,14 +227,24 @@ export class SparkLayer implements Renderer {
     end();
   }
 
+  #column(label: number, cell: number): Column {
+    const known = this.#columns.get(cell);
+    if (known) return known;
+    const column = { label, shown: [], bounds: null, drawn: true, since: 0, weight: 0, marks: null };
+    this.#columns.set(cell, column);
+    return column;
+  }
+
   #isDrawn({ drawn, label }: Column): boolean {
     return drawn && !this.#hidden.has(label);
   }
 
   /** Draws what is shown and in sight; the previous picture stays until this is sorted. */
   #draw(): void {
-    const columns = [...this.#columns.values()].filter((column) => this.#isDrawn(column));
-    this.#pool.draw(columns.flatMap(({ shown, color }) => shown.map(({ part }) => ({ part, color }))));
+    const increments = [...this.#columns.values()].flatMap((column) =>
+      this.#isDrawn(column) ? column.shown : [],
+    );
+    this.#pool.draw(increments.map(({ cell, part }) => ({ part, color: rgbOf(this.#colors.get(cell)) })));
     this.#mesh.updateMappingVersion();
     this.#dirty();
   }
@@ -245,9 +253,10 @@ export class SparkLayer implements Renderer {
   #paint(cell: number, column: Column, added: readonly Increment[]): void {
     const { shown, marks } = column;
     const weight = this.#weights.get(cell)?.[(shown.at(-1)?.level ?? 0) - 1] ?? 0;
-    const isOther = marks || weight !== column.weight || added.some(({ part }) => part.earlier);
+    const hasEarlier = added.some(({ part }) => part.earlier);
+    if (hasEarlier) enterEarlier(shown.map(({ part }) => part));
+    const isOther = hasEarlier || marks || weight !== column.weight;
     column.weight = weight;
-    enterEarlier(shown.map(({ part }) => part));
     let start = 0;
     for (const increment of shown) {
       const { part } = increment;
@@ -261,17 +270,6 @@ export class SparkLayer implements Renderer {
     }
   }
 }
-
-const emptyColumn = (label: number): Column => ({
-  label,
-  color: 0x8a8f98,
-  shown: [],
-  bounds: null,
-  drawn: true,
-  since: 0,
-  weight: 0,
-  marks: null,
-});
 
 /** Changes the colours of lit splats and the opacities of hidden ones. */
 function applyMarks(words: Uint32Array, marks: Uint8Array): void {
@@ -302,6 +300,9 @@ function startWorker(answered: (answers: readonly Answer[]) => void, failed: () 
   worker.onerror = failed;
   return worker;
 }
+
+/** 0xrrggbb of #rrggbb. */
+const rgbOf = (color = "#8a8f98"): number => Number.parseInt(color.slice(1), 16);
 
 const total = (increments: readonly Handle[]) => increments.reduce((sum, { count }) => sum + count, 0);
 
