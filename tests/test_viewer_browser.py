@@ -597,6 +597,28 @@ def test_on_an_unlimited_link_no_more_comes_than_the_plan(promised_bundle: Path,
         assert opened.complaints == []
 
 
+def test_a_second_visit_downloads_no_level_again(promised_bundle: Path, browser: Any) -> None:
+    with (
+        serve(promised_bundle, ranges=True) as url,
+        open_page(f"{url}?target=0.7", browser=browser) as opened,
+    ):
+        ready(opened)
+        promises(opened)
+        first = opened.page.evaluate("sagesplat.state().bytesShown")
+        opened.wait_for(
+            "caches.keys().then(async ([name]) => name && (await (await caches.open(name)).keys()).length)"
+        )
+        asked: list[str] = []
+        opened.page.on("request", lambda request: asked.append(request.url))
+        opened.page.reload()
+        ready(opened)
+        promises(opened)
+        assert opened.page.evaluate("sagesplat.state().bytesShown") == first > 0
+        assert any("manifest.json" in url for url in asked)
+        assert [url for url in asked if "/chunks/" in url] == []
+        assert opened.complaints == []
+
+
 # windows
 
 WINDOWS = ((1400, 900), (700, 450), (500, 400), (390, 844), (360, 640), (844, 390), (1000, 600))

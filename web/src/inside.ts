@@ -6,6 +6,8 @@ import type { Fetch, Reply } from "./core/download";
 export interface Source {
   readonly base: URL; // of the bundle's folder, ending in a slash
   readonly fetch: Fetch;
+  readonly isInside?: boolean; // the page holds the files
+  readonly known?: ReadonlyMap<string, Uint8Array>; // files that need no download, by key
 }
 
 const BASE = new URL("https://bundle.invalid/"); // never asked
@@ -17,6 +19,7 @@ export function sourceInside(page: ParentNode): Source | null {
   const files = new Map([...elements].map((one) => [new URL(one.dataset.uri ?? "", BASE).href, one]));
   return {
     base: BASE,
+    isInside: true,
     fetch: async (url, init) => {
       const text = files.get(url)?.textContent;
       if (text === undefined || text === null) return MISSING;

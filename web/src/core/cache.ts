@@ -25,6 +25,11 @@ export class LruCache {
     }
   }
 
+  /** Keys and contents, the oldest first. */
+  entries(): IterableIterator<[string, Uint8Array]> {
+    return this.kept.entries();
+  }
+
   clear(): void {
     this.kept.clear();
     this.size = 0;

@@ -163,7 +163,11 @@ function refused(file: File, status: number): DownloadError {
 }
 
 /** The content if it has the size and hash in the manifest; damage may be temporary, so a retry is allowed. */
-export async function intact(link: Link, file: File, content: Uint8Array): Promise<Uint8Array> {
+export async function intact(
+  link: Pick<Link, "digest">,
+  file: File,
+  content: Uint8Array,
+): Promise<Uint8Array> {
   const { uri, offset, bytes } = file;
   const name = offset === undefined ? uri : `${uri}, ${bytes} bytes from ${offset} on,`;
   if (content.length !== bytes) {

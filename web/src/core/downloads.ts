@@ -82,7 +82,7 @@ export class Downloads {
   /** Starts loading the beginning of a pack, and takes from it what one request brings. */
   openPack(pack: Pack): void {
     this.pack = pack;
-    if (pack.beginning.length) void this.run(pack.beginning);
+    if (pack.beginning.some((file) => !this.isHere(file))) void this.run(pack.beginning);
   }
 
   isHere(file: File): boolean {

@@ -36,6 +36,7 @@ export interface StreamerOptions {
   readonly now?: () => number; // ms, instead of the clock's
   readonly digest?: Digest;
   readonly keepBytes?: number; // cache of downloaded files
+  readonly known?: ReadonlyMap<string, Uint8Array>; // files that need no download, by key
   readonly beside?: Streamer; // one of the same bundle: what it has fetched is not fetched again
   readonly downloads?: number; // concurrent downloads, at most
 }
@@ -106,6 +107,7 @@ export class Streamer {
       changed: () => this.arrived(),
       ...(options.downloads && { maxDownloads: options.downloads }),
     });
+    for (const [key, content] of options.known ?? []) this.downloads.cache.put(key, content);
     this.downloads.setRanges(rangesIn(this.entries));
     const { position, quaternion } = manifest.start;
     this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [], lens: LENS };
@@ -120,6 +122,12 @@ export class Streamer {
     if (this.known?.bytesLoaded !== this.downloads.received) this.known = null;
     this.known ??= this.describe();
     return this.known;
+  }
+
+  /** Ranges of files that are here, by key. */
+  get ranges(): [string, Uint8Array][] {
+    const keys = new Set(rangesIn(this.entries).map(({ key }) => key));
+    return [...this.downloads.cache.entries()].filter(([key]) => keys.has(key));
   }
 
   /** The viewpoint models that are planned with, once they are there. */

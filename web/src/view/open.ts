@@ -1,7 +1,13 @@
+import { digestOfBrowser, type File } from "../core/download";
+import { Kept } from "../core/kept";
 import { loadManifest } from "../core/manifest";
+import type { Streamer } from "../core/streamer";
 import type { Options } from "../embed";
 import type { Source } from "../inside";
+import type { Manifest } from "../types";
 import { Viewer } from "./viewer";
+
+const KEEP_AFTER = 2000; // ms of rest
 
 /**
  * A viewer on a new canvas that fills an element; `start` begins it. Rejects with a message for the user, and then
@@ -18,15 +24,48 @@ export async function openViewer(
   if (!document.createElement("canvas").getContext("webgl2")) {
     throw new Error("This browser has no WebGL 2; enable hardware acceleration or use another browser.");
   }
-  const manifest = await loadManifest(source.base, source.fetch);
+  const [manifest, kept] = await Promise.all([
+    loadManifest(source.base, source.fetch),
+    source.isInside ? null : Kept.open(source.base),
+  ]);
+  const known = await kept?.read(rangesOf(manifest), digestOfBrowser);
   const canvas = document.createElement("canvas");
   canvas.tabIndex = 0;
   Object.assign(canvas.style, { display: "block", width: "100%", height: "100%", touchAction: "none" });
   element.append(canvas);
   try {
-    return new Viewer(canvas, manifest, source, options, keys ?? canvas);
+    const viewer = new Viewer(
+      canvas,
+      manifest,
+      known ? { ...source, known } : source,
+      options,
+      keys ?? canvas,
+    );
+    if (kept) void keep(kept, viewer.streamer);
+    return viewer;
   } catch (error) {
     canvas.remove();
     throw error;
+  }
+}
+
+/** The levels that are ranges of files. */
+const rangesOf = ({ labels }: Manifest): File[] =>
+  labels
+    .flatMap(({ cells }) => cells.flatMap(({ levels }) => levels))
+    .filter(({ offset }) => offset !== undefined);
+
+/** Keeps what a streamer downloads, soon after it has all that it wants. */
+async function keep(kept: Kept, streamer: Streamer): Promise<void> {
+  for (;;) {
+    await new Promise<void>((resolve) => {
+      const stop = streamer.onChange(() => {
+        stop();
+        resolve();
+      });
+    });
+    await streamer.idle();
+    await new Promise((resolve) => setTimeout(resolve, KEEP_AFTER));
+    await kept.add(streamer.ranges);
   }
 }

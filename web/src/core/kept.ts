@@ -1,0 +1,101 @@
+/** Ranges of files that were downloaded in earlier visits: browsers' own caches keep few of them. */
+
+import { type Digest, type File, intact } from "./download";
+
+const LIMIT = 64 * 2 ** 20; // bytes of a bundle
+
+type Contents = Iterable<readonly [key: string, content: Uint8Array]>;
+
+/**
+ * What the browser keeps of a bundle, with the cache that pages have. An entry has the contents that came together: the
+ * length of an index (4 bytes), the index (JSON: keys and lengths), and the contents. Nothing here rejects: what
+ * cannot be kept is downloaded again.
+ */
+export class Kept {
+  private readonly keys = new Set<string>();
+  private bytes = 0;
+
+  private constructor(
+    private readonly store: Cache,
+    private readonly base: URL,
+  ) {}
+
+  /** Null where the browser keeps nothing: without https, in private windows, in pages from the disk. */
+  static async open(base: URL, caches: CacheStorage | undefined = globalThis.caches): Promise<Kept | null> {
+    try {
+      return caches ? new Kept(await caches.open(`sagesplat ${base.href}`), base) : null;
+    } catch {
+      return null;
+    }
+  }
+
+  /** The contents of files, by key, as far as they are here and as the manifest has them; forgets entries of others. */
+  async read(files: readonly File[], digest: Digest): Promise<Map<string, Uint8Array>> {
+    const wanted = new Map(files.map((file) => [file.key, file]));
+    const found = new Map<string, Uint8Array>();
+    try {
+      await Promise.all(
+        (await this.store.keys()).map(async (request) => {
+          const reply = await this.store.match(request);
+          const all = unpacked((await reply?.arrayBuffer()) ?? new ArrayBuffer(0));
+          const own = all.filter(([key]) => wanted.has(key));
+          const isSound = await Promise.all(
+            own.map(([key, content]) => intact({ digest }, wanted.get(key) as File, content)),
+          ).then(
+            () => own.length > 0,
+            () => false,
+          );
+          if (!isSound) return this.store.delete(request);
+          for (const [key, content] of own) found.set(key, content);
+          return this.count(all);
+        }),
+      );
+    } catch {
+      // the browser has cleared it meanwhile
+    }
+    return found;
+  }
+
+  /** Keeps contents that are not kept yet. */
+  async add(contents: Contents): Promise<void> {
+    const added = [...contents].filter(([key]) => !this.keys.has(key));
+    const body = packed(added);
+    if (!added.length || this.bytes + body.size > LIMIT) return;
+    this.count(added);
+    try {
+      await this.store.put(new URL(`kept/${Date.now()}`, this.base), new Response(body));
+    } catch {
+      // no room
+    }
+  }
+
+  private count(contents: Contents): void {
+    for (const [key, content] of contents) {
+      this.keys.add(key);
+      this.bytes += content.length;
+    }
+  }
+}
+
+function packed(contents: readonly (readonly [string, Uint8Array])[]): Blob {
+  const index = new TextEncoder().encode(JSON.stringify(contents.map(([key, { length }]) => [key, length])));
+  return new Blob([
+    Uint32Array.of(index.length),
+    index,
+    ...contents.map(([, content]) => content),
+  ] as BlobPart[]);
+}
+
+/** The contents of an entry; of what is none: none. */
+function unpacked(entry: ArrayBuffer): [string, Uint8Array][] {
+  try {
+    let at = 4 + new DataView(entry).getUint32(0, true);
+    const index: [string, number][] = JSON.parse(new TextDecoder().decode(new Uint8Array(entry, 4, at - 4)));
+    return index.map(([key, length]) => {
+      at += length;
+      return [key, new Uint8Array(entry.slice(at - length, at))];
+    });
+  } catch {
+    return [];
+  }
+}
