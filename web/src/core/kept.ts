@@ -39,9 +39,8 @@ export class Kept {
           const reply = await this.store.match(request);
           const all = unpacked((await reply?.arrayBuffer()) ?? new ArrayBuffer(0));
           const own = all.filter(([key]) => wanted.has(key));
-          const isSound = await Promise.all(
-            own.map(([key, content]) => intact({ digest }, wanted.get(key) as File, content)),
-          ).then(
+          const checks = own.map(([key, content]) => intact({ digest }, wanted.get(key) as File, content));
+          const isSound = await Promise.all(checks).then(
             () => own.length > 0,
             () => false,
           );
