@@ -7,7 +7,6 @@ export interface Source {
   readonly base: URL; // of the bundle's folder, ending in a slash
   readonly fetch: Fetch;
   readonly isInside?: boolean; // the page holds the files
-  readonly known?: ReadonlyMap<string, Uint8Array>; // files that need no download, by key
 }
 
 const BASE = new URL("https://bundle.invalid/"); // never asked

@@ -1,4 +1,4 @@
-/** Ranges of files that were downloaded in earlier visits: browsers' own caches keep few of them. */
+/** Ranges of files that were downloaded in earlier visits: Chromium's own cache keeps few of them. */
 
 import { type Digest, type File, intact } from "./download";
 
@@ -58,11 +58,11 @@ export class Kept {
   /** Keeps contents that are not kept yet. */
   async add(contents: Contents): Promise<void> {
     const added = [...contents].filter(([key]) => !this.keys.has(key));
-    const body = packed(added);
-    if (!added.length || this.bytes + body.size > LIMIT) return;
+    const bytes = added.reduce((sum, [, { length }]) => sum + length, 0);
+    if (!added.length || this.bytes + bytes > LIMIT) return;
     this.count(added);
     try {
-      await this.store.put(new URL(`kept/${Date.now()}`, this.base), new Response(body));
+      await this.store.put(new URL(`kept/${Date.now()}`, this.base), new Response(packed(added)));
     } catch {
       // no room
     }

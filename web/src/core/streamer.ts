@@ -36,7 +36,6 @@ export interface StreamerOptions {
   readonly now?: () => number; // ms, instead of the clock's
   readonly digest?: Digest;
   readonly keepBytes?: number; // cache of downloaded files
-  readonly known?: ReadonlyMap<string, Uint8Array>; // files that need no download, by key
   readonly beside?: Streamer; // one of the same bundle: what it has fetched is not fetched again
   readonly downloads?: number; // concurrent downloads, at most
 }
@@ -107,7 +106,6 @@ export class Streamer {
       changed: () => this.arrived(),
       ...(options.downloads && { maxDownloads: options.downloads }),
     });
-    for (const [key, content] of options.known ?? []) this.downloads.cache.put(key, content);
     this.downloads.setRanges(rangesIn(this.entries));
     const { position, quaternion } = manifest.start;
     this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [], lens: LENS };
@@ -122,6 +120,11 @@ export class Streamer {
     if (this.known?.bytesLoaded !== this.downloads.received) this.known = null;
     this.known ??= this.describe();
     return this.known;
+  }
+
+  /** Takes contents of files, by key, that need no download; to be called before the start. */
+  know(contents: ReadonlyMap<string, Uint8Array>): void {
+    for (const [key, content] of contents) this.downloads.cache.put(key, content);
   }
 
   /** Ranges of files that are here, by key. */

@@ -34,13 +34,8 @@ export async function openViewer(
   Object.assign(canvas.style, { display: "block", width: "100%", height: "100%", touchAction: "none" });
   element.append(canvas);
   try {
-    const viewer = new Viewer(
-      canvas,
-      manifest,
-      known ? { ...source, known } : source,
-      options,
-      keys ?? canvas,
-    );
+    const viewer = new Viewer(canvas, manifest, source, options, keys ?? canvas);
+    if (known) viewer.streamer.know(known);
     if (kept) void keep(kept, viewer.streamer);
     return viewer;
   } catch (error) {

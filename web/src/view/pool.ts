@@ -25,7 +25,7 @@ const UNPACK = [
 type Source = NonNullable<ConstructorParameters<typeof SplatMesh>[0]>["splats"] & object;
 
 /** Splats that are drawn, and the colour (0xrrggbb) that they are tinted with. */
-export interface Drawn {
+interface Drawn {
   readonly part: Part;
   readonly color: number;
 }
