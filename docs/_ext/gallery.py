@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from sagesplat import open_run
+
 
 _BUILD = Path(__file__).parents[2] / "build"
 _PAGE = "gallery"
@@ -34,6 +34,8 @@ def _fill(app: Any, page: str, source: list[str]) -> None:
 
 def _scene(name: str, nbytes: int) -> str:
     """A live scene, and what its plans cost."""
+    from sagesplat import open_run  # slow to import
+
     run = open_run(_BUILD / name)
     rows = [
         f"| fidelity {plan.target:g} | {plan.count:,} | {(plan.transfer_bytes or 0) / 1000:,.0f} kB |"
