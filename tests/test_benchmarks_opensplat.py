@@ -1,13 +1,13 @@
 """OpenSplat and sagesplat in turns: a program that behaves as OpenSplat's command line does stands for it."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import random_gaussians, write_capture
+from test_benchmarks import run_benchmark
 
 from benchmarks.opensplat import Course, Program, compared, course_of, main, training_workspace
 from sagesplat import load_scene, write_ply
@@ -124,8 +124,8 @@ def test_a_psnr_that_is_not_reached_has_no_ratio() -> None:
     assert found["sagesplat"]["seconds_to_psnr"] == 1.5
 
 
-def test_it_is_a_benchmark_with_help() -> None:
-    command = [sys.executable, "-m", "benchmarks", "opensplat", "--help"]
-    root = Path(__file__).parents[1]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True)
-    assert "--binary" in done.stdout
+def test_it_is_a_benchmark_with_help(capsys, monkeypatch) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run_benchmark(monkeypatch, "opensplat", "--help")
+    assert not ended.value.code
+    assert "--binary" in capsys.readouterr().out

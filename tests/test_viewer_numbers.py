@@ -4,7 +4,7 @@ import json
 from base64 import b64decode, b64encode
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sagesplat.viewer.numbers import LISTS, packed, unpacked
@@ -18,6 +18,7 @@ _documents = _entries.flatmap(
 
 
 @given(_documents)
+@settings(max_examples=30)  # each has thousands of numbers
 def test_what_is_packed_comes_back(document):
     sent = json.loads(json.dumps(packed(document)))
     assert unpacked(sent) == document

@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-
-
 _BUILD = Path(__file__).parents[2] / "build"
 _PAGE = "gallery"
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float32, Int, Int16, Int32, UInt16
 
 from sagesplat.adapt.ladder import Ladder, PrefixLadder
@@ -23,7 +24,8 @@ from sagesplat.core.gaussians import Gaussians
 from sagesplat.io.array_file import ArrayFile, Stored
 from sagesplat.io.files import atomic_path
 from sagesplat.io.npz import Npz
-from sagesplat.metrics.image import box_of, means_by_label, ssim_map, tiles_around
+from sagesplat.kernels.planes import to_planes
+from sagesplat.metrics.image import box_of, means_by_label, ssim_between, tiles_around
 from sagesplat.raster import Backend, Workspace, device_of, each_view
 from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
@@ -193,6 +195,16 @@ class Reference:
         """Colours in [0, 1]."""
         return self.colours if self.colours.dtype == np.float32 else self.colours / _STEPS
 
+    @cached_property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns that wanted categories are in."""
+        return (slice(None), slice(None)) if self.tile_mask is None else box_of(self.tile_mask)
+
+    @cached_property
+    def planes(self) -> Float32[np.ndarray, "3 H W2"]:
+        """The image in the box, as planes: all compositions are compared with it."""
+        return to_planes(torch.from_numpy(self.image[self.box]), Workspace(), "")
+
 
 class _Kept(NamedTuple):
     """A `Reference` whose pictures are in a file."""
@@ -326,9 +338,9 @@ class References:
                 self._ladder.compose(levels), camera, backend=self._backend, antialiased=self._antialiased,
                 workspace=self._workspace,
             )  # fmt: skip
-        box = (slice(None), slice(None)) if at.tile_mask is None else box_of(at.tile_mask)
-        quality = ssim_map(image[box], at.image[box])
-        means = means_by_label(quality, at.label_ids[box])
+        shown, space = torch.from_numpy(image[at.box]), self._workspace
+        quality = ssim_between(to_planes(shown, space, "shown"), at.planes, shown.shape[1], space)
+        means = means_by_label(quality, at.label_ids[at.box])
         by_label = [
             means[label][0] if label in means and wanted else np.nan
             for label, wanted in zip(self.labels, self.wanted, strict=True)
