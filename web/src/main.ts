@@ -1,5 +1,6 @@
 import { inAdvance } from "./core/advance";
 import type { Fetch } from "./core/download";
+import { Kept } from "./core/kept";
 import { bundleUrl, type Embed, linkTo, type Options, parseOptions } from "./embed";
 import { bytesFrom, type Source, sourceInside } from "./inside";
 import { formatName } from "./ui/format";
@@ -33,12 +34,15 @@ async function begin(): Promise<void> {
   } else await showOnline(app, options);
 }
 
-/** Shows a bundle of a server. The pack that the page names is asked for together with the manifest. */
+/**
+ * Shows a bundle of a server. The pack that the page names is asked for together with the manifest, but where an earlier
+ * visit kept levels.
+ */
 async function showOnline(app: HTMLElement, options: Options): Promise<void> {
   const base = bundleUrl(options.bundle, location.href);
   const online: Fetch = (url, init) => fetch(url, init);
   const named = options.bundle ? null : packNamed(document);
-  if (!named) return show(app, { base, fetch: online }, options);
+  if (!named || (await Kept.isKnown(base))) return show(app, { base, fetch: online }, options);
   const pack = inAdvance(online, new URL(named.uri, base).href, named.bytes);
   try {
     await show(app, { base, fetch: pack.fetch }, options);

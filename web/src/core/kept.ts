@@ -1,4 +1,4 @@
-/** Ranges of files that were downloaded in earlier visits: Chromium's own cache keeps few of them. */
+/** Files, or ranges of them, that were downloaded in earlier visits: Chromium's own cache keeps few ranges. */
 
 import { type Digest, type File, intact } from "./download";
 
@@ -20,10 +20,19 @@ export class Kept {
     private readonly base: URL,
   ) {}
 
+  /** Whether an earlier visit opened this bundle, so that its levels are probably kept. */
+  static async isKnown(base: URL, caches: CacheStorage | undefined = globalThis.caches): Promise<boolean> {
+    try {
+      return (await caches?.has(nameOf(base))) ?? false;
+    } catch {
+      return false;
+    }
+  }
+
   /** Null where the browser keeps nothing: without https, in private windows, in pages from the disk. */
   static async open(base: URL, caches: CacheStorage | undefined = globalThis.caches): Promise<Kept | null> {
     try {
-      return caches ? new Kept(await caches.open(`sagesplat ${base.href}`), base) : null;
+      return caches ? new Kept(await caches.open(nameOf(base)), base) : null;
     } catch {
       return null;
     }
@@ -75,6 +84,8 @@ export class Kept {
     }
   }
 }
+
+const nameOf = (base: URL): string => `sagesplat ${base.href}`;
 
 function packed(contents: readonly (readonly [string, Uint8Array])[]): Blob {
   const index = new TextEncoder().encode(JSON.stringify(contents.map(([key, { length }]) => [key, length])));

@@ -50,11 +50,12 @@ const WITHOUT_MODELS = "levels are planned by what holds for all viewpoints.";
 const LENS = [0.8, 0.5] as const; // until there is a viewpoint
 const UNCHECKED = "Served without https: files are checked by their size only.";
 
-/** All that are ranges of files, palettes included. */
-const rangesIn = (entries: readonly Entry[]): File[] => {
-  const palettes = entries.flatMap(({ label }) => label.palette ?? []);
-  return [...new Set(palettes), ...entries.flatMap(({ cell }) => cell.levels)];
-};
+/** All that pictures are drawn from, in the order of their ranges: palettes and levels. */
+export const filesToDraw = ({ labels }: Manifest): File[] =>
+  labels.flatMap(({ palette, cells }) => [
+    ...(palette ? [palette] : []),
+    ...cells.flatMap(({ levels }) => levels),
+  ]);
 
 export class Streamer {
   private readonly renderer: Renderer;
@@ -106,7 +107,7 @@ export class Streamer {
       changed: () => this.arrived(),
       ...(options.downloads && { maxDownloads: options.downloads }),
     });
-    this.downloads.setRanges(rangesIn(this.entries));
+    this.downloads.setRanges(filesToDraw(manifest));
     const { position, quaternion } = manifest.start;
     this.viewpoint = { position, direction: rotate(quaternion, [0, 0, -1]), frustum: [], lens: LENS };
   }
@@ -127,9 +128,9 @@ export class Streamer {
     for (const [key, content] of contents) this.downloads.cache.put(key, content);
   }
 
-  /** Ranges of files that are here, by key. */
-  get ranges(): [string, Uint8Array][] {
-    const keys = new Set(rangesIn(this.entries).map(({ key }) => key));
+  /** Contents of the files to draw that are here, by key. */
+  get contents(): [string, Uint8Array][] {
+    const keys = new Set(filesToDraw(this.content).map(({ key }) => key));
     return [...this.downloads.cache.entries()].filter(([key]) => keys.has(key));
   }
 
@@ -451,7 +452,7 @@ export class Streamer {
     this.leaving.push(...leaving);
     this.modelsByQuality.clear();
     this.content = manifest;
-    this.downloads.setRanges(rangesIn(entries));
+    this.downloads.setRanges(filesToDraw(manifest));
     this.trouble = null;
     this.downloads.clearFailures();
     this.plan();

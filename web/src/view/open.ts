@@ -1,10 +1,9 @@
-import { digestOfBrowser, type File } from "../core/download";
+import { digestOfBrowser } from "../core/download";
 import { Kept } from "../core/kept";
 import { loadManifest } from "../core/manifest";
-import type { Streamer } from "../core/streamer";
+import { filesToDraw, type Streamer } from "../core/streamer";
 import type { Options } from "../embed";
 import type { Source } from "../inside";
-import type { Manifest } from "../types";
 import { Viewer } from "./viewer";
 
 const KEEP_AFTER = 2000; // ms of rest
@@ -28,7 +27,7 @@ export async function openViewer(
     loadManifest(source.base, source.fetch),
     source.isInside ? null : Kept.open(source.base),
   ]);
-  const known = await kept?.read(rangesOf(manifest), digestOfBrowser);
+  const known = await kept?.read(filesToDraw(manifest), digestOfBrowser);
   const canvas = document.createElement("canvas");
   canvas.tabIndex = 0;
   Object.assign(canvas.style, { display: "block", width: "100%", height: "100%", touchAction: "none" });
@@ -44,12 +43,6 @@ export async function openViewer(
   }
 }
 
-/** The levels that are ranges of files. */
-const rangesOf = ({ labels }: Manifest): File[] =>
-  labels
-    .flatMap(({ cells }) => cells.flatMap(({ levels }) => levels))
-    .filter(({ offset }) => offset !== undefined);
-
 /** Keeps what a streamer downloads, soon after it has all that it wants. */
 async function keep(kept: Kept, streamer: Streamer): Promise<void> {
   for (;;) {
@@ -61,6 +54,6 @@ async function keep(kept: Kept, streamer: Streamer): Promise<void> {
     });
     await streamer.idle();
     await new Promise((resolve) => setTimeout(resolve, KEEP_AFTER));
-    await kept.add(streamer.ranges);
+    await kept.add(streamer.contents);
   }
 }

@@ -9,6 +9,7 @@ const BASE = new URL("https://example.org/garden/");
 /** The caches of a browser. */
 class Caches {
   readonly all = new Map<string, Map<string, ArrayBuffer>>();
+  readonly has = async (name: string) => this.all.has(name);
   async open(name: string) {
     const kept = this.all.get(name) ?? new Map<string, ArrayBuffer>();
     this.all.set(name, kept);
@@ -52,6 +53,16 @@ describe("what is kept of earlier visits", () => {
     expect([...(await second.read(files, digest))].sort()).toEqual(some(1, 2, 3));
     await second.add(some(1, 2, 3));
     expect(caches.entries.size).toBe(2);
+  });
+
+  test("is known from the second visit on", async () => {
+    const isKnown = () => Kept.isKnown(BASE, caches as unknown as CacheStorage);
+    expect(await isKnown()).toBe(false);
+    await visit();
+    expect(await isKnown()).toBe(true);
+    expect(await Kept.isKnown(BASE, undefined)).toBe(false);
+    const broken = { has: () => Promise.reject(new Error("private window")) };
+    expect(await Kept.isKnown(BASE, broken as unknown as CacheStorage)).toBe(false);
   });
 
   test("is forgotten where it is of another bundle, damaged or no entry", async () => {
