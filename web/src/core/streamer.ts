@@ -317,14 +317,14 @@ export class Streamer {
   /** The palettes that have not arrived of levels that are next. */
   private missingPalettes(): File[] {
     const needed = this.entries.flatMap((entry) => (entry.next && entry.paletteOf(entry.next)) || []);
-    return [...new Set(needed)].filter(({ key }) => !this.palettes.has(key));
+    return [...new Set(needed)].filter((palette) => !this.contentOf(palette));
   }
 
-  private takePalettes(): void {
-    for (const palette of this.missingPalettes()) {
-      const content = this.downloads.take(palette);
-      if (content) this.palettes.set(palette.key, content);
-    }
+  /** A palette, if it has arrived or is known. */
+  private contentOf(palette: File): Uint8Array | undefined {
+    const content = this.palettes.get(palette.key) ?? this.downloads.take(palette);
+    if (content) this.palettes.set(palette.key, content);
+    return content;
   }
 
   private missingPromises(): File[] {
@@ -363,7 +363,7 @@ export class Streamer {
     if (!file || entry.decoding || this.decodes >= MAX_DECODES) return;
     if (this.downloads.failure(file)?.lasting) return;
     const palette = entry.paletteOf(level);
-    const bytes = palette && this.palettes.get(palette.key);
+    const bytes = palette && this.contentOf(palette);
     if (palette && !bytes) return;
     const content = entry.contents[level - 1] ?? this.downloads.take(file);
     const known = palette && bytes && { key: palette.key, bytes };
@@ -404,7 +404,6 @@ export class Streamer {
   private arrived(): void {
     if (this.phase !== "running") return;
     this.takePromises();
-    this.takePalettes();
     const capped = this.entries.some((entry) => entry.wanted > this.highest(entry));
     if (capped) this.plan();
     else this.work();

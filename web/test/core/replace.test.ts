@@ -97,6 +97,15 @@ test.each([
   expect(w.streamer.state.message).toBe(null);
 });
 
+test("what an earlier visit kept is not asked for again, palettes included", async () => {
+  const first = await started("full", GIVEN);
+  const w = world(GIVEN);
+  w.streamer.know(new Map(first.streamer.contents));
+  await w.run({ mode: "full" });
+  expect(shown(w.streamer.state)).toEqual([5, 5, 5, 5]);
+  expect(w.streamer.state.bytesLoaded).toBe(w.manifest.promises.fidelity?.bytes ?? 0);
+});
+
 test("below the levels that need it no palette is asked for", async () => {
   const w = await started("base", GIVEN);
   expect(shown(w.streamer.state)).toEqual([1, 1, 1, 1]);
