@@ -25,7 +25,7 @@ from sagesplat.train.strategy import schedule_of
 _WORTH_TELLING = 60.0  # seconds
 _TIMED = 3  # steps, after one that compiles
 _MOST_TIMED = 300_000  # Gaussians; what larger models take follows from a straight line
-# Of a step on as many Gaussians (docs/performance.md): a nested step, which draws prefixes and rounds; a
+# Of a step on as many Gaussians, as measured: a nested step, which draws prefixes and rounds; a
 # step of the base model, which is small half of the time; a render.
 _NESTED, _BASE, _RENDER = 0.9, 0.8, 0.25
 _DRAWN = 2.5  # renders at drawn viewpoints for each step of the training and of its levels
