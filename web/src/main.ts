@@ -42,7 +42,7 @@ async function showOnline(app: HTMLElement, options: Options): Promise<void> {
   const base = bundleUrl(options.bundle, location.href);
   const online: Fetch = (url, init) => fetch(url, init);
   const named = options.bundle ? null : packNamed(document);
-  if (!named || (await Kept.isKnown(base))) return show(app, { base, fetch: online }, options);
+  if (!named || Kept.isKnown(base)) return show(app, { base, fetch: online }, options);
   const pack = inAdvance(online, new URL(named.uri, base).href, named.bytes);
   try {
     await show(app, { base, fetch: pack.fetch }, options);

@@ -1,6 +1,7 @@
 /** Files, or ranges of them, that were downloaded in earlier visits: Chromium's own cache keeps few ranges. */
 
 import { type Digest, type File, intact } from "./download";
+import { remember, remembered } from "./storage";
 
 const LIMIT = 64 * 2 ** 20; // bytes of a bundle
 
@@ -20,13 +21,9 @@ export class Kept {
     private readonly base: URL,
   ) {}
 
-  /** Whether an earlier visit opened this bundle, so that its levels are probably kept. */
-  static async isKnown(base: URL, caches: CacheStorage | undefined = globalThis.caches): Promise<boolean> {
-    try {
-      return (await caches?.has(nameOf(base))) ?? false;
-    } catch {
-      return false;
-    }
+  /** Whether an earlier visit kept something of a bundle, without waiting for it: the cache takes its time to open. */
+  static isKnown(base: URL): boolean {
+    return remembered(nameOf(base)) !== null;
   }
 
   /** Null where the browser keeps nothing: without https, in private windows, in pages from the disk. */
@@ -72,6 +69,7 @@ export class Kept {
     this.count(added);
     try {
       await this.store.put(new URL(`kept/${Date.now()}`, this.base), new Response(packed(added)));
+      remember(nameOf(this.base), "kept");
     } catch {
       // no room
     }

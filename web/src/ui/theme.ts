@@ -1,4 +1,4 @@
-import { remember, remembered } from "./storage";
+import { remember, remembered } from "../core/storage";
 
 const KEY = "sagesplat-theme";
 const THEMES = ["auto", "light", "dark"] as const;

@@ -1,5 +1,5 @@
+import { remember, remembered } from "../core/storage";
 import { h, isTouch, textButton } from "./dom";
-import { remember, remembered } from "./storage";
 
 const KEY = "sagesplat-welcome";
 const MOUSE = "Drag to turn, scroll to come closer, W A S D to walk.";

@@ -1,4 +1,4 @@
-import { beforeEach, describe, expect, test } from "vitest";
+import { beforeEach, describe, expect, test, vi } from "vitest";
 import { digestOfBrowser, type File } from "../../src/core/download";
 import { Kept } from "../../src/core/kept";
 
@@ -9,7 +9,6 @@ const BASE = new URL("https://example.org/garden/");
 /** The caches of a browser. */
 class Caches {
   readonly all = new Map<string, Map<string, ArrayBuffer>>();
-  readonly has = async (name: string) => this.all.has(name);
   async open(name: string) {
     const kept = this.all.get(name) ?? new Map<string, ArrayBuffer>();
     this.all.set(name, kept);
@@ -56,13 +55,20 @@ describe("what is kept of earlier visits", () => {
   });
 
   test("is known from the second visit on", async () => {
-    const isKnown = () => Kept.isKnown(BASE, caches as unknown as CacheStorage);
-    expect(await isKnown()).toBe(false);
-    await visit();
-    expect(await isKnown()).toBe(true);
-    expect(await Kept.isKnown(BASE, undefined)).toBe(false);
-    const broken = { has: () => Promise.reject(new Error("private window")) };
-    expect(await Kept.isKnown(BASE, broken as unknown as CacheStorage)).toBe(false);
+    const storage = new Map<string, string>();
+    vi.stubGlobal("localStorage", {
+      getItem: (key: string) => storage.get(key) ?? null,
+      setItem: (key: string, value: string) => void storage.set(key, value),
+    });
+    const kept = await visit();
+    expect(Kept.isKnown(BASE)).toBe(false);
+    await kept.add(some(1));
+    expect(Kept.isKnown(BASE)).toBe(true);
+    expect(Kept.isKnown(new URL("https://example.org/other/"))).toBe(false);
+    vi.unstubAllGlobals();
+    expect(Kept.isKnown(BASE)).toBe(false);
+    await kept.add(some(2));
+    expect(caches.entries.size).toBe(2);
   });
 
   test("is forgotten where it is of another bundle, damaged or no entry", async () => {
