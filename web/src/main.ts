@@ -35,8 +35,8 @@ async function begin(): Promise<void> {
 }
 
 /**
- * Shows a bundle of a server. The pack that the page names is asked for together with the manifest, but where an earlier
- * visit kept levels.
+ * Shows a bundle of a server. The pack that the page names is asked for together with the manifest, unless an
+ * earlier visit kept levels.
  */
 async function showOnline(app: HTMLElement, options: Options): Promise<void> {
   const base = bundleUrl(options.bundle, location.href);

@@ -63,9 +63,13 @@ def ssim_map(
         >>> bool(np.allclose(ssim_map(photo, photo), 1, atol=1e-5)), ssim_map(photo, 1 - photo).shape
         (True, (32, 48))
     """
-    space, width = Workspace(), x.shape[1]
-    one, other = (to_planes(torch.from_numpy(i), space, name) for i, name in ((x, "x"), (y, "y")))
-    return ssim_between(one, other, width, space, tile_mask)
+    space = Workspace()
+    return ssim_between(*_planes(x, y, space), x.shape[1], space, tile_mask)
+
+
+def _planes(x: np.ndarray, y: np.ndarray, space: Workspace) -> tuple[np.ndarray, np.ndarray]:
+    """Two images as planes."""
+    return to_planes(torch.from_numpy(x), space, "x"), to_planes(torch.from_numpy(y), space, "y")
 
 
 def ssim_between(
@@ -97,7 +101,7 @@ def ssim_planes(
 ) -> Float32[np.ndarray, "3 H W"]:
     """`ssim_map` of each channel."""
     space, width = Workspace(), x.shape[1]
-    one, other = (to_planes(torch.from_numpy(i), space, name) for i, name in ((x, "x"), (y, "y")))
+    one, other = _planes(x, y, space)
     values = np.empty_like(one)
     _maps(one, other, width, tile_mask, space, values)
     return values[..., :width]

@@ -23,7 +23,7 @@ export class Kept {
 
   /** Whether an earlier visit kept something of a bundle, without waiting for it: the cache takes its time to open. */
   static isKnown(base: URL): boolean {
-    return remembered(nameOf(base)) !== null;
+    return Boolean(remembered(nameOf(base)));
   }
 
   /** Null where the browser keeps nothing: without https, in private windows, in pages from the disk. */
@@ -58,6 +58,7 @@ export class Kept {
     } catch {
       // the browser has cleared it meanwhile
     }
+    if (!found.size && Kept.isKnown(this.base)) remember(nameOf(this.base), ""); // of no use any more
     return found;
   }
 
