@@ -51,7 +51,7 @@ export interface Manifest {
     count: Whole;
     bytes: Whole;
   };
-  /** Of a Gaussian in the memory of a graphics card. */
+  /** Of a Gaussian in the textures that the viewer draws from, at most while a scene grows. */
   gpuBytes: number;
   ladder?: Sha256;
   /** What fidelities look like: a picture with the same part of a view for each, side by side, equally wide; 1 is the full scene. */

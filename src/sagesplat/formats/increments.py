@@ -43,7 +43,9 @@ _FORMATS: dict[str, Format] = {STREAM: "stream", ".ply": "ply"}  # by suffix; al
 _FINE_BITS = 8, 8  # of SH coefficients
 _CURE = "delete that folder and run `sagesplat nest` again"
 _FILE_NAME = re.compile(r"(?!\.)[A-Za-z0-9_.-]{1,200}")
-GPU_BYTES = (16, 24, 40, 56)  # per Gaussian in Spark 2.2, by SH degree
+# per Gaussian in the viewer's textures, by SH degree, while a scene grows at most: its words and its entry in
+# the table, with room for half as many more; its place in the order, and what Spark 2.2 draws from, twice
+GPU_BYTES = tuple(3 * (words + 8) // 2 + 4 + 2 * 36 for words in (16, 24, 40, 56))
 
 
 @dataclass(frozen=True)
