@@ -130,7 +130,7 @@ def test_on_the_path_and_off_it_each_keeps_its_targets():
     assert near < 0.99  # one threshold for both keeps all of these
 
 
-@pytest.mark.parametrize("confidence", [0.9, 0.95])
+@pytest.mark.parametrize("confidence", [pytest.param(0.9, marks=pytest.mark.slow), 0.95])
 def test_every_target_of_every_category_is_kept_at_new_viewpoints(confidence):
     kept = {target: [] for target in (0.6, 0.77, 0.8, 0.9, 0.95, 0.98)}
     wasted = {target: [] for target in kept}

@@ -145,6 +145,7 @@ def test_a_run_that_did_not_end_has_its_settings(tmp_path: Path) -> None:
     assert "nest" not in recorded_settings(run)
 
 
+@pytest.mark.slow
 def test_settings_of_a_run_are_kept_until_it_ends(
     run: Path, capture: Path, monkeypatch: pytest.MonkeyPatch, command: Call
 ) -> None:

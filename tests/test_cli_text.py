@@ -44,6 +44,7 @@ def test_a_run_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
     assert (tmp_path / "run" / "nested" / "report" / "index.html").exists()
 
 
+@pytest.mark.slow
 def test_a_splat_by_text(folder: Path, tmp_path: Path, command: Call) -> None:
     g = random_gaussians(300, degree=1, logit=2.0)
     write_ply(tmp_path / "ball.ply", replace(g, label_ids=torch.full_like(g.label_ids, -1)))

@@ -97,12 +97,21 @@ def resolve(name: str) -> object | None:
     return found
 
 
-def test_links_outside_of_the_site_lead_somewhere():
-    """Those of pages of the site are followed by `tests/test_site.py`, anchors included."""
-    for path in ROOT.glob("*.md"):
-        for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
-            if not target.startswith(("http://", "https://", "#")):
-                assert (ROOT / target.partition("#")[0]).exists(), f"{path.name}: {target}"
+def anchors(path: Path) -> set[str]:
+    """Names of the headings of a page, as GitHub and the site make them."""
+    headings = re.findall(r"^#+ (.+)$", path.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\s-]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("path", [*ROOT.glob("*.md"), *PAGES], ids=lambda path: path.name)
+def test_links_lead_somewhere(path):
+    """As the pages are written; what is generated is followed by `tests/test_site.py`."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+        if not target.startswith(("http://", "https://", "mailto:")):
+            name, _, anchor = target.partition("#")
+            there = path.parent / name if name else path
+            assert there.exists(), f"{path.name}: {target}"
+            assert not anchor or anchor in anchors(there), f"{path.name}: {target}"
 
 
 def test_no_message_or_comment_names_a_page_that_is_gone():

@@ -80,6 +80,7 @@ def test_a_web_page_has_its_bundle_and_what_is_promised(finished, tmp_path):
     assert (tmp_path / "site" / "scene" / "manifest.json").is_file()
 
 
+@pytest.mark.slow
 def test_a_splat_of_gsplats_trainer_becomes_levels_that_are_measured(tmp_path):
     g = random_gaussians(300, degree=1, logit=2.0)
     splats = torch.nn.ParameterDict({name: torch.nn.Parameter(t) for name, t in g.to_gsplat().items()})

@@ -87,6 +87,7 @@ def test_map_agrees(size):
     torch.testing.assert_close(actual, of_cpu, atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow
 def test_tiles_out_of_the_loss():
     """The render there is seen by nothing; their neighbours are, across edges and corners."""
     x, y = pair(35, 40, seed=2)

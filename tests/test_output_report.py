@@ -322,6 +322,7 @@ def test_the_next_step_is_what_was_measured():
     assert [step.title for step in steps(worse, Commands("run"))] == ["Measure at more viewpoints"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(chromium.missing() is not None, reason=chromium.missing() or "")
 def test_the_page_is_for_everybody(whole):
     with launch() as browser:

@@ -52,6 +52,7 @@ def test_the_pinned_versions_run_on_the_lowest_python() -> None:
     assert {name: text for name, text in needs.items() if not SpecifierSet(text).contains(lowest)} == {}
 
 
+@pytest.mark.slow
 def test_sdist_and_wheel_hold_everything(tmp_path: Path) -> None:
     """The wheel is built from the sdist, and so proves that one too."""
     pytest.importorskip("hatchling", reason="needs the extra dev")

@@ -21,6 +21,7 @@ from sagesplat.cli.help import flags_of
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
@@ -46,9 +47,7 @@ def site(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReques
     return out / "html"
 
 
-@pytest.mark.parametrize(
-    "site", ["basic", pytest.param("furo", marks=pytest.mark.slow)], indirect=True, scope="module"
-)
+@pytest.mark.parametrize("site", ["basic", "furo"], indirect=True, scope="module")
 def test_links_pictures_and_anchors_lead_somewhere(site):
     pages = {path: Page(path.read_text()) for path in site.rglob("*.html")}
     assert len(pages) > 35
@@ -90,7 +89,6 @@ def browser(site: Path) -> Iterator["Browser"]:
         yield launched
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("site", ["furo"], indirect=True, scope="module")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_pages_are_sound_on_a_phone(site, browser, scheme):
@@ -105,7 +103,6 @@ def test_pages_are_sound_on_a_phone(site, browser, scheme):
             assert opened.complaints == [], name
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("site", ["furo"], indirect=True, scope="module")
 def test_search_finds_a_flag_from_the_disk(site, browser):
     address = f"{(site / 'search.html').as_uri()}?q=freeze-at"

@@ -180,6 +180,7 @@ def test_a_notebook_shows_the_single_page_of_the_run(runs, tmp_path):
         run.show(height=9)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing()))
 def test_the_viewer_in_a_notebook_draws(runs, tmp_path):
     cell = runs["nested"].show()._repr_html_()

@@ -105,6 +105,7 @@ def test_it_trains_as_on_the_cpu(scene, on_gpu, monkeypatch, config):  # noqa: F
     np.testing.assert_allclose(losses[0][-6:], losses[1][-6:], rtol=0.1)
 
 
+@pytest.mark.slow
 def test_a_category_stops(scene, on_gpu, monkeypatch):  # noqa: F811
     masks, seen = Halves(), []
     drawn = stepper.rasterize
@@ -161,6 +162,7 @@ def test_mcmc_and_what_was_killed(scene, on_gpu, tmp_path):  # noqa: F811
         assert torch.equal(getattr(final(whole), name), getattr(final(again), name)), name
 
 
+@pytest.mark.slow
 def test_quality_is_what_the_cpu_measures(scene, on_gpu, monkeypatch):  # noqa: F811
     g = final(run(scene, replace(SHORT, max_steps=8)))
     work, rows = ActiveTiles(scene, Halves()), measured_views(scene, Halves())  # type: ignore[arg-type]

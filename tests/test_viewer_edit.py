@@ -124,6 +124,7 @@ def test_a_region_is_split_off_by_its_ranks(editing: Opened, bundle: Path) -> No
     assert chosen.sum() > 0.8 * (~is_white).sum()  # all but those that lie apart
 
 
+@pytest.mark.slow
 @browser_test
 def test_where_levels_replace_those_below_ranks_are_of_the_last_one(tmp_path: Path, browser: Any) -> None:
     """Merged splats are in no category of their own: the full model is loaded while the editor is open."""

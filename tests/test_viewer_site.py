@@ -224,6 +224,7 @@ window.found = found
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
 def test_a_browser_lets_the_viewer_do_what_it_needs_and_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
