@@ -1,5 +1,5 @@
 // Visitors of a bundle and what they ask for: node test/visitors.report.mjs BUNDLE OUT.json [--visits N] [--seed S]
-// [--scale K] [--no-pack]. Time is simulated, so results repeat exactly. docs/scaling.md says what they are for.
+// [--scale K]. Time is simulated, so results repeat exactly. docs/scaling.md says what they are for.
 
 import { existsSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
@@ -14,7 +14,6 @@ const { values, positionals } = parseArgs({
     visits: { type: "string", default: "16" },
     seed: { type: "string", default: "1" },
     scale: { type: "string", default: "1" },
-    "no-pack": { type: "boolean", default: false },
   },
 });
 const [bundle, out] = positionals;
@@ -24,7 +23,7 @@ const root = fileURLToPath(new URL("..", import.meta.url));
 const { module: sim } = await runnerImport(join(root, "test/visitors.ts"), { root, configFile: false });
 
 const original = readFileSync(join(bundle, "manifest.json"), "utf8");
-const manifest = sim.resized(original, scale, !values["no-pack"]);
+const manifest = sim.resized(original, scale);
 const promises = manifest.promises.fidelity?.uri;
 
 /** Bytes that a server sends, which packs text and nothing else. */

@@ -162,8 +162,8 @@ function recording(network: Network, clock: VirtualClock, log: Request[]): Fetch
   };
 }
 
-/** A bundle's manifest whose increments have so many times the bytes; `pack`: whether it keeps its pack. */
-export function resized(json: string, scale: number, pack: boolean): Manifest {
+/** A bundle's manifest whose increments have so many times the bytes. */
+export function resized(json: string, scale: number): Manifest {
   const manifest = parseManifest(json);
   const resize = (level: Level): Level => ({
     ...level,
@@ -175,8 +175,8 @@ export function resized(json: string, scale: number, pack: boolean): Manifest {
     cells: label.cells.map((cell) => ({ ...cell, levels: cell.levels.map(resize) })),
   }));
   const totals = { ...manifest.totals, bytes: manifest.totals.bytes * scale };
-  const stream = manifest.pack && { ...manifest.pack, bytes: manifest.pack.bytes * scale };
-  return { ...manifest, labels, totals, pack: pack ? (stream ?? null) : null };
+  const pack = manifest.pack && { ...manifest.pack, bytes: manifest.pack.bytes * scale };
+  return { ...manifest, labels, totals, pack };
 }
 
 export const textOf = (manifest: Manifest): string => JSON.stringify(documentOf(manifest));
