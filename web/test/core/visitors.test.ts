@@ -60,10 +60,13 @@ test("visitors ask for the page, then the manifest, then what the planner wants"
   expect(order[0]).toBe("index.html");
   expect(order.indexOf("manifest.json")).toBeGreaterThan(order.indexOf("assets/index-AAAAAAAA.js"));
   expect(order.indexOf(manifest.pack?.uri ?? "")).toBeGreaterThan(order.indexOf("manifest.json"));
-  const came = log.filter(({ uri }) => /^chunks|pack$/.test(uri)).reduce((sum, { bytes }) => sum + bytes, 0);
-  expect(came).toBe(manifest.totals.bytes);
+  const came = (asked: typeof log) =>
+    asked.filter(({ uri }) => /^chunks|pack$/.test(uri)).reduce((sum, { bytes }) => sum + bytes, 0);
+  expect(came(log)).toBe(manifest.totals.bytes);
+  const large = resized(JSON.stringify(documentOf(manifest)), 10);
+  expect(came(await visit(large, files, everything, 20, 1))).toBe(10 * manifest.totals.bytes);
   expect(await visit(manifest, files, everything, 20, 1)).toEqual(log);
-  const single = await visit(resized(JSON.stringify(documentOf(manifest)), 1, false), files, target, 30, 1);
+  const single = await visit({ ...manifest, pack: null }, files, target, 30, 1);
   const chunks = single.map(({ uri }) => uri).filter((uri) => uri.startsWith("chunks/"));
   expect(chunks.length).toBeGreaterThan(4);
   expect(new Set(chunks).size).toBe(chunks.length);
