@@ -115,7 +115,11 @@ def test_recorded_dictionaries_and_flags_that_are_off_can_be_given_again(
         made = read_json(record)
         made["settings"] |= more
         record.write_text(json.dumps(made))
-    for words, weights in (((), {"vase": 5.0}), (("--weights", "tree", "3"), {"tree": 3.0})):
+    for words, weights in (
+        ((), {"vase": 5.0}),
+        (("--weights", "tree", "3"), {"tree": 3.0}),
+        (("--weights",), {}),
+    ):
         code, said = command("plan", run, *words)
         assert code == 0, said
         assert seen["config"].weights == weights

@@ -42,7 +42,7 @@ def arguments(name: str, function: Callable[..., None], words: Sequence[str]) ->
     values = _parse(name, function, words)
     known = _recorded(name, function, values, words)
     if known:
-        values = _with_dicts(_parse(name, _with_defaults(function, known), words), known)
+        values = _with_dicts(_parse(name, _with_defaults(function, known), words), known, words)
     for flag in flags_of(function):
         value = values[flag.setting[0]]
         value = getattr(value, flag.setting[1]) if len(flag.setting) == 2 else value
@@ -145,11 +145,12 @@ def _without_dicts(value: Any) -> Any:
     return replace(value, **{name: {} for name in _dicts(value)})
 
 
-def _with_dicts(values: dict[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Parsed values with the recorded dictionaries where none were given."""
+def _with_dicts(values: dict[str, Any], known: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+    """Parsed values with the recorded dictionaries where their option is not given."""
     found = dict(values)
+    given = {word.removeprefix("--").rpartition(".")[2] for word in words if word.startswith("--")}
     for name, value in known.items():
-        kept = {key: entries for key, entries in _dicts(value).items() if not getattr(found[name], key)}
+        kept = {key: entries for key, entries in _dicts(value).items() if key not in given}
         found[name] = replace(found[name], **kept) if kept else found[name]
     return found
 

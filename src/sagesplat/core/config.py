@@ -302,7 +302,7 @@ class PlanConfig:
     budget_unit: Literal["bytes", "gpu-bytes", "count"] = "bytes"
     """Unit of the budget: bytes to transfer, bytes of GPU memory in the viewer, or Gaussians."""
     weights: dict[str, Weight] = field(default_factory=dict)
-    """Weights of categories within the budget, by name (1 unless named)."""
+    """Weights of categories within the budget, by name (1 unless named; nothing after it: 1 for all)."""
 
     @property
     def quality(self) -> Literal["fidelity", "ssim"]:
