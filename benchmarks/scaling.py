@@ -218,7 +218,7 @@ def drawn(visits: Mapping[str, Mapping[str, float]], days: Sequence[Mapping[str,
     ):
         load.loglog(viewers, [row[name] for row in days], "o-", ms=4, label=label)
     load.set(xlabel="viewers a day", ylabel="requests/s in the busiest minute")
-    load.legend()
+    load.legend(loc="lower right")
     return figure
 
 
