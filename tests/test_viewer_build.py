@@ -14,7 +14,7 @@ import pytest
 from test_viewer_browser import FRAMES, serve, three_walls
 
 import sagesplat
-from benchmarks.scaling.visits import KINDS, read
+from benchmarks.scaling import KINDS, read
 from sagesplat.viewer.built import package_viewer
 from sagesplat.viewer.bundle import write_bundle
 
@@ -69,11 +69,11 @@ def test_visits_of_a_bundle_are_recorded(npm: Npm, tmp_path: Path) -> None:
         "exec", "--", "node", str(recorder), str(tmp_path / "walls"), str(tmp_path / "visits.json")
     )
     assert recorded.returncode == 0, recorded.stderr
-    visits = read([tmp_path / "visits.json"])
+    visits = read(tmp_path / "visits.json")
     chunks = {path.name: path.stat().st_size for path in (tmp_path / "walls" / "chunks").iterdir()}
-    sizes = visits.sizes[visits.kinds == KINDS.index("chunk")]
+    sizes = visits.sizes[visits.kinds == list(KINDS).index("chunk")]
     assert sorted(sizes.tolist()) == sorted(chunks.values())
-    assert visits.per_visit()[0, visits.profile == 0].sum() > sizes.sum()
+    assert visits.sent[visits.profile == 0].sum() > sizes.sum()
 
 
 def test_the_built_viewer_is_current(npm: Npm, tmp_path: Path) -> None:
