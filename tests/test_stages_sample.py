@@ -11,7 +11,7 @@ from conftest import job_of
 
 from sagesplat.adapt import fidelity
 from sagesplat.adapt.cell_models import expect, promised
-from sagesplat.adapt.fidelity import fill_levels, measure_compositions, measure_levels
+from sagesplat.adapt.fidelity import measure_compositions, measure_levels
 from sagesplat.adapt.observe import RenderedLabels, observe
 from sagesplat.adapt.viewpoints import Rule, draw, read_viewpoints
 from sagesplat.core.config import FitConfig, SampleConfig
@@ -24,7 +24,7 @@ from sagesplat.run.run_dir import RunDir
 from sagesplat.stages import sample
 from sagesplat.stages.fit import fit_ladder
 from sagesplat.stages.results import fidelity_of, sampled_of, viewpoints_of
-from sagesplat.stages.sample import measured_levels, sample_levels
+from sagesplat.stages.sample import sample_levels
 
 FEW = SampleConfig(views=6, calibration_views=4)
 
@@ -176,29 +176,3 @@ def test_the_error_decides_how_many_viewpoints_are_measured(job: Job, monkeypatc
         monkeypatch.setattr(sample, "fit_fidelity", lambda *_, models=models: next(models))
         table, used = sample._until_it_stops_shrinking(job, drawn, FitConfig(), False)
         assert used == len(table.fidelity) == wanted
-
-
-def test_levels_that_are_not_measured_are_filled_in(job: Job):
-    cameras = viewpoints_of(job).cameras[:8]
-    every, second = (measured_levels(job, cameras, every=n) for n in (1, 2))
-    known = np.isfinite(second.whole)
-    np.testing.assert_array_equal(known, [[True, False, True, True], [False, True, False, True]] * 4)
-    np.testing.assert_array_equal(second.whole[known], every.whole[known])
-    filled = fill_levels(second)
-    seen = every.pixels > 0
-    np.testing.assert_array_equal(np.isfinite(filled.fidelity), np.isfinite(every.fidelity))
-    np.testing.assert_array_equal(filled.whole[known], every.whole[known])
-    assert np.abs(filled.fidelity - every.fidelity)[seen].mean() < 0.3 * every.fidelity[seen].std()
-    assert fill_levels(every).whole is not every.whole
-    np.testing.assert_array_equal(fill_levels(every).fidelity, every.fidelity)
-
-
-def test_a_view_misses_in_between_what_it_misses_over_the_average(job: Job):
-    missed = np.array([[0.8, 0.4, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0], [0.8, 0.4, 0.2, 0.0]], np.float32)
-    table = measured_levels(job, viewpoints_of(job).cameras[:3])
-    fidelity = np.repeat(1 - missed[:, None], 2, 1)
-    fidelity[0, :, 1] = fidelity[1, :, 0] = fidelity[1, :, 2] = np.nan
-    table = replace(table, fidelity=fidelity, pixels=np.ones((3, 2), np.int32), whole=fidelity[:, 0].copy())
-    filled = fill_levels(table).fidelity
-    np.testing.assert_allclose(1 - filled[:, 0], missed, atol=0.03)
-    np.testing.assert_array_equal(filled[:, 0], filled[:, 1])

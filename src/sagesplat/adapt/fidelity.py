@@ -31,8 +31,6 @@ from sagesplat.scene.scene import Camera
 from sagesplat.segment.masks import UNLABELLED
 
 _KEEP = 4 * 10**8  # bytes of a file of the full model's pictures: plans look where models were fitted
-_LEAST_MISSING = 1e-4  # on average, that a view's part is of
-_FILLS = 5  # by averages over all views, filled in as before
 _STEPS = np.float32(2**16 - 1)  # of colours in them: half the memory, and SSIM is the same to 3e-6
 _SEEN_BYTES = 44  # of a Gaussian in what its levels are rendered from
 _KEEP_LEVELS = 10**8  # of what levels are rendered from: for many Gaussians it takes as much as 20 pictures
@@ -96,7 +94,6 @@ def measure_levels(
     ladder: Ladder,
     cameras: Sequence[Camera],
     *,
-    some: Bool[np.ndarray, "V K"] | None = None,
     only: Collection[int] | None = None,
     full: Gaussians | None = None,
     backend: Backend = "auto",
@@ -108,7 +105,6 @@ def measure_levels(
     Args:
         ladder: The levels.
         cameras: V viewpoints.
-        some: Which levels to measure at each viewpoint; None: all. The others are NaN (`fill_levels`).
         only: Ids of the categories to measure, by rendering the parts of images that show them; None: all.
         full: The full model, where it is not the last level.
         backend: Rasteriser; decides the device.
@@ -117,63 +113,28 @@ def measure_levels(
 
     Returns:
         fidelity [V, L, K] of the labels in ascending order, NaN where one is not in sight or not measured;
-        pixels [V, L]; fidelity of the whole image [V, K], NaN where not all are measured.
+        pixels [V, L]; fidelity of the whole image [V, K], NaN below the last level unless all are measured.
     """
     references = References(ladder, backend, antialiased, keep=0, only=only, full=full)
-    if some is None:
-        some = np.ones((len(cameras), len(ladder.levels)), bool)
+    measured = ladder.levels[:-1] if full is None else ladder.levels
     labels = references.labels
     found = np.full((len(cameras), len(labels), len(ladder.levels)), np.nan, np.float32)
     pixels = np.zeros(found.shape[:2], np.int32)
-    whole = np.full((len(cameras), len(ladder.levels)), np.nan, np.float32)
+    whole = np.ones((len(cameras), len(ladder.levels)), np.float32)
 
     def at_viewpoint(row: int) -> None:
         camera = cameras[row]
         at = references.at(camera)
         pixels[row] = at.pixels
-        if full is None:  # the last level is the full model
-            found[row, (pixels[row] > 0) & references.wanted, -1] = whole[row, -1] = 1.0
-        for column in np.flatnonzero(some[row] if full else some[row, :-1]).tolist():
-            of_level = dict.fromkeys(labels, ladder.levels[column])
+        found[row, (pixels[row] > 0) & references.wanted, -1] = 1.0
+        for column, level in enumerate(measured):
+            of_level = dict.fromkeys(labels, level)
             found[row, :, column], whole[row, column] = references.compare(of_level, camera, at)
 
     for done, _ in enumerate(each_view(at_viewpoint, range(len(cameras)), device_of(backend)), 1):
         if progress:
             progress(done, len(cameras))
     return found, pixels, whole
-
-
-def fill_levels(table: SampledFidelity) -> SampledFidelity:
-    """The table with what was not measured of some levels.
-
-    What a view misses at a level, over what views miss there on average, is interpolated between the levels
-    that were measured in the view.
-    """
-    fidelity, whole = table.fidelity.copy(), table.whole.copy()
-    for row, seen in zip(fidelity.transpose(1, 0, 2), table.pixels.T > 0, strict=True):
-        row[seen] = _filled(row[seen])
-    whole[:] = _filled(whole)
-    return replace(table, fidelity=fidelity, whole=whole)
-
-
-def _filled(values: Float32[np.ndarray, "V K"]) -> Float32[np.ndarray, "V K"]:
-    known, levels = np.isfinite(values), np.arange(values.shape[1])
-    views = known.sum(0)
-    if known.all() or not views.any():
-        return values
-    missing = np.where(known, 1 - values, 0).sum(0)
-    average = np.interp(levels, levels[views > 0], (missing / np.maximum(views, 1))[views > 0])
-    found = values.copy()
-    for _ in range(_FILLS):
-        average = np.maximum(average, _LEAST_MISSING)
-        for row, own in zip(found, known, strict=True):
-            # nothing is missing at the level that is the full model, however much is elsewhere
-            tells = own & (row < 1) if (own & (row < 1)).any() else own
-            if tells.any():
-                part = np.interp(levels, levels[tells], (1 - row[tells]) / average[tells])
-                row[~own] = (1 - part * average)[~own]
-        average = 1 - np.nanmean(found, 0)
-    return found
 
 
 def measure_compositions(

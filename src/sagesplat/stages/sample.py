@@ -1,4 +1,4 @@
-"""Makes the samples of fidelity: levels at drawn viewpoints, measured against the full model."""
+"""Makes the samples of fidelity: every level at drawn viewpoints, measured against the full model."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
@@ -7,7 +7,7 @@ import numpy as np
 
 from sagesplat.adapt.calibrate_fidelity import NOMINAL
 from sagesplat.adapt.cells import look
-from sagesplat.adapt.fidelity import SampledFidelity, fill_levels, measure_levels, write_sampled
+from sagesplat.adapt.fidelity import SampledFidelity, measure_levels, write_sampled
 from sagesplat.adapt.fidelity_models import fit_fidelity
 from sagesplat.adapt.viewpoints import (
     Rule,
@@ -37,9 +37,6 @@ MOST = {"fit": VIEWS[-1], "bias": 90, "calibration": 300}  # after a long traini
 _EXTRA = 0.25  # this share of its time: they make bounds a little tighter, no more
 _RENDERS = 4.0  # a training step: sampling and fitting take 0.8 of the demo's training, 0.36 with nesting
 _SEED = 0  # of the draws
-# Of so many levels one is measured at a viewpoint, in turns: models err by 2 % more, and sampling takes 0.7
-# of the time (docs/developers/promises.md)
-_EVERY = 2
 _SOME = 100  # that tell how many pixels viewpoints have
 _LABEL_IMAGE = 4  # renders that a viewpoint's label image takes
 _FEWEST = {"fit": 20, "bias": 4, "calibration": 20}
@@ -48,7 +45,7 @@ _ALONE = 1.5
 
 
 def sample_levels(job: Job, config: SampleConfig, fit: FitConfig) -> None:
-    """Draw viewpoints, and measure levels of every category there against the full model.
+    """Draw viewpoints, and measure every level of every category there against the full model.
 
     Nested levels only. `fit`: the confidence of preliminary models.
     """
@@ -94,7 +91,7 @@ def _counts(job: Job, config: SampleConfig, pixels: float) -> dict[str, int]:
     renders = _RENDERS * (train["max_steps"] + nest["steps"] + base_steps) / pixels
     compositions = 2 * (len(NOMINAL) + _LABEL_IMAGE)  # measured twice, for the bias three times
     levels = len(job.ladder.levels)
-    cost = {"fit": levels / _EVERY + _LABEL_IMAGE, "bias": 1.5 * compositions, "calibration": compositions}
+    cost = {"fit": levels + _LABEL_IMAGE, "bias": 1.5 * compositions, "calibration": compositions}
     part = renders / sum(DEFAULT_COUNTS[name] * cost[name] for name in DEFAULT_COUNTS)
     counts = {name: max(int(min(part, 1) * DEFAULT_COUNTS[name]), _FEWEST[name]) for name in DEFAULT_COUNTS}
     left = renders - sum(counts[name] * cost[name] for name in counts)
@@ -122,12 +119,12 @@ def _until_it_stops_shrinking(
     table, errors = None, []
     for stop in stops:
         start = 0 if table is None else len(table.fidelity)
-        more = measured_levels(job, cameras[start:stop], every=_EVERY)
+        more = measured_levels(job, cameras[start:stop])
         table = more if table is None else _joined(table, more)
         if stop == stops[-1]:
             break
         models = fit_fidelity(
-            fill_levels(table), job.cells, cameras[:stop], job.scene.scale, fit.confidence, drawn.focal,
+            table, job.cells, cameras[:stop], job.scene.scale, fit.confidence, drawn.focal,
             drawn.rule.screens, capture_cameras(job.scene),
         )  # fmt: skip
         errors.append(float(np.mean([model.rmse for model in models.values()])))
@@ -139,21 +136,17 @@ def _until_it_stops_shrinking(
             f"{job.run.path}: none of {len(table.pixels)} viewpoints shows anything of the scene; draw them "
             "closer to its cameras (--sample.shift, --sample.places 1 0 0), or leave out --sample.viewpoints"
         )
-    return fill_levels(table), len(table.fidelity)
+    return table, len(table.fidelity)
 
 
 def measured_levels(
-    job: Job, cameras: Sequence[Camera], only: Collection[int] | None = None, every: int = 1
+    job: Job, cameras: Sequence[Camera], only: Collection[int] | None = None
 ) -> SampledFidelity:
     """Fidelity of the cells' levels at some viewpoints, divided among those who compute.
 
     `only`: ids of the cells that are measured; the others, and the whole image, are NaN. None: all.
-    `every`: of how many levels one is measured at a viewpoint, in turns, and the last; the others are NaN.
     """
-    levels, rows = np.arange(len(job.ladder.levels)), np.arange(len(cameras))
-    some = ((rows[:, None] + levels) % every == 0) | (levels == levels[-1])
-    views = list(zip(cameras, some, strict=True))
-    parts = [(list(part), only) for part in split(views, job.pieces)]
+    parts = [(list(part), only) for part in split(cameras, job.pieces)]
     found = work_all(job, "sample", _measure_some, parts)
     fidelity, pixels, whole = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     distance = look(job.cells, cameras).distance.astype(np.float32)
@@ -162,13 +155,11 @@ def measured_levels(
 
 
 def _measure_some(
-    job: Job, part: tuple[Sequence[tuple[Camera, np.ndarray]], Collection[int] | None]
+    job: Job, part: tuple[Sequence[Camera], Collection[int] | None]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    views, only = part
-    cameras, some = [camera for camera, _ in views], np.array([levels for _, levels in views], bool)
+    cameras, only = part
     return measure_levels(
-        job.by_cell, cameras, some=some, only=only, full=job.came_in, backend=job.backend,
-        antialiased=job.antialiased,
+        job.by_cell, cameras, only=only, full=job.came_in, backend=job.backend, antialiased=job.antialiased,
         progress=lambda done, total: job.emit(Progress("sample", done, total)),
     )  # fmt: skip
 
