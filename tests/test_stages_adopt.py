@@ -25,7 +25,7 @@ from sagesplat.core.errors import RunError
 from sagesplat.core.events import Event, StageDone, Warned
 from sagesplat.core.gaussians import Gaussians
 from sagesplat.formats.increments import read_index
-from sagesplat.formats.label_edits import FILE, Hide, LabelEdits, Split, dump_edits, ladder_hash
+from sagesplat.formats.label_edits import FILE, Hide, LabelEdits, Rename, Split, dump_edits, ladder_hash
 from sagesplat.formats.labels import sidecar, write_labels
 from sagesplat.formats.ply import read_ply, write_ply
 from sagesplat.formats.splats import read_splat, write_splat
@@ -204,6 +204,19 @@ def test_what_is_clicked_becomes_a_category_with_levels_and_promises(adopted: Pa
     manifest = json.loads((made.bundle.path / "manifest.json").read_text())
     assert [label["name"] for label in manifest["labels"] if label.get("hidden")] == ["roof"]
     apply_labels(job, viewer=viewer)  # replaces the earlier one, from what is there already
+
+
+def test_what_is_renamed_has_its_looks_beside_what_came_in(adopted: Path, viewer: Path) -> None:
+    job = Job(RunDir(adopted), lambda event: None, "cpu")
+    edits = LabelEdits(ladder_hash(increments_of(job), job.names()), (Rename("car", "bus"),))
+    (adopted / FILE).write_bytes(dump_edits(edits))
+    made = apply_labels(job, out=adopted.with_name("renamed"), viewer=viewer)
+    new = Job(RunDir(made.path), lambda event: None, "cpu")
+    assert job.came_in is not None
+    assert new.came_in is not None
+    assert torch.equal(new.came_in.means, job.came_in.means)
+    assert not made.trained
+    assert "looks" in json.loads((made.bundle.path / "manifest.json").read_text())
 
 
 def test_levels_are_a_file_of_streams_for_each_category(adopted: Path) -> None:

@@ -37,6 +37,7 @@ from sagesplat.stages.export import export_scene
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
+from sagesplat.stages.report import make_report
 from sagesplat.stages.shared import observed
 from sagesplat.studies.paper.cross_view import read_cross_view
 from sagesplat.studies.paper.run import cross_views
@@ -490,6 +491,12 @@ def test_export_writes_what_other_viewers_read(finished: Path, tmp_path: Path) -
         export_scene(job, tmp_path / "a.ksplat", **options)
     with pytest.raises(RunError, match="levels are for lod-meta"):
         export_scene(job, tmp_path / "b.ply", **options, levels=[1])
+    target = {**options, "target": ("fidelity", 0.9)}
+    with pytest.raises(RunError, match=r"b\.ply: a level, or the scene planned for a target"):
+        export_scene(job, tmp_path / "b.ply", **target)
+    for wrong in (options, {**target, "level": None}):
+        with pytest.raises(RunError, match="holds several levels"):
+            export_scene(job, tmp_path / "b.ssog", **wrong)
 
 
 def test_export_writes_levels_of_detail(finished: Path, tmp_path: Path) -> None:
@@ -529,3 +536,23 @@ def test_one_gaussian_is_a_category_too(tmp_path: Path) -> None:
     chunks = write_increments(tmp_path / "chunks", g, sizes, {0: "a", 1: "b"}, label_of={0: 0, 1: 1})
     assert [(c.label_id, c.level) for c in chunks] == [(0, 1), (1, 1), (1, 4)]
     assert totals(chunks, [0, 1], 4, "count").tolist() == [[1, 1, 1, 1], [1, 1, 1, 2]]
+
+
+def test_an_unknown_category_is_told_before_a_plan_is_given_up(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    job = job_of(tmp_path / "run", force=True)
+    before = job.run.provenance("plan").read_bytes()
+    with pytest.raises(RunError, match="no category 'foo'; there are"):
+        make_plan(job, PlanConfig(budget=1e5, weights={"foo": 2.0}))
+    assert job.run.provenance("plan").read_bytes() == before
+
+
+def test_a_report_is_of_what_was_composed_and_measured(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    job = job_of(tmp_path / "run", force=True)
+    make_plan(job, PlanConfig(target_fidelity=0.5))
+    with pytest.raises(RunError, match=r"planned anew; run `sagesplat compose .*run` before the report"):
+        make_report(job)
+    compose_plan(job)
+    with pytest.raises(RunError, match=r"planned anew; run `sagesplat evaluate .*run` before the report"):
+        make_report(job)

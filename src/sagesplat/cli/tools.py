@@ -60,12 +60,13 @@ def export(
     from sagesplat.segment.edit import parse_names
     from sagesplat.stages.export import export_increments, export_scene
 
-    if chunks and (only or without):
-        raise RunError(f"{out}: --only and --without are for one scene; leave them out with --chunks")
-    given = {"--rasterize-mode": rasterize_mode, "--labels-inside": labels_inside, "--doubles": doubles}
-    if chunks and any(given.values()):
-        one = next(name for name, value in given.items() if value)
-        raise RunError(f"{out}: {one} is for one scene; leave it out with --chunks")
+    of_scenes = {
+        "--only": only, "--without": without, "--level": level, "--levels": levels,
+        "--target-fidelity": target_fidelity, "--target-ssim": target_ssim,
+        "--rasterize-mode": rasterize_mode, "--labels-inside": labels_inside, "--doubles": doubles,
+    }  # fmt: skip
+    if chunks and (given := [name for name, value in of_scenes.items() if value]):
+        raise RunError(f"{out}: {given[0]} does not go with --chunks; leave it out")
     if target_fidelity is not None and target_ssim is not None:
         raise RunError(f"{out}: a scene has one target; leave out --target-ssim or --target-fidelity")
     with open_job(run, machine, ladder) as job:

@@ -125,6 +125,10 @@ def export_scene(
     wanted = [label for label in wanted if label not in gone]
     if not wanted:
         raise RunError(f"{path}: no category is left; leave out some of --without")
+    if level is not None and target is not None:
+        raise RunError(f"{path}: a level, or the scene planned for a target; leave one of them out")
+    if writer.write_levels and (level is not None or target is not None):
+        raise RunError(f"{path}: holds several levels; leave out --level and targets (--levels chooses)")
     if writer.write_levels:
         return _export_levels(job, path, writer.write_levels, levels, wanted, rasterize_mode or "playcanvas")
     if levels:

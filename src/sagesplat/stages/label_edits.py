@@ -193,7 +193,10 @@ def _begin(job: Job, fresh: Path, edits: LabelEdits, made: Relabelled) -> Job:
     """Copy what stays to the new folder; the job on it."""
     started = _job_on(job, fresh)
     new = started.run
-    for names, source, target in ((_KEPT, job.run.path, fresh), (_OF_LADDER, job.run.adapted, new.adapted)):
+    # fidelity is against the splat that came in; what was trained here is the last nested level
+    came_in = (job.run.levels.name,) if job.run.adopted.exists() else ()
+    folders = (((*_KEPT, *came_in), job.run.path, fresh), (_OF_LADDER, job.run.adapted, new.adapted))
+    for names, source, target in folders:
         target.mkdir(exist_ok=True)
         for name in names:
             if (source / name).is_dir():

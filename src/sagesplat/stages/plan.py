@@ -16,7 +16,7 @@ from sagesplat.run.stage import run_stage
 from sagesplat.segment.display_names import titles
 from sagesplat.stages.methods import method_for, method_of
 from sagesplat.stages.results import budget_plan_of, plans_of
-from sagesplat.stages.shared import label_image_inputs
+from sagesplat.stages.shared import label_image_inputs, label_named
 
 PAPER_TARGETS = (0.6, 0.7, 0.8)  # SSIM, where a run has no such target of its own
 
@@ -37,6 +37,8 @@ def make_plan(job: Job, config: PlanConfig) -> None:
     run, method = job.run, method_of(job)
     config = check_targets(config, run.ladder)
     method.check(config)
+    for name in config.weights:  # before an earlier plan is given up
+        label_named(job, name)
 
     def make() -> list[str]:
         scene_plans = method.plan_scenes(config.all_targets, config.share)
@@ -100,7 +102,7 @@ def scene_plan(job: Job, quality: QualityKind, target: float) -> Plan:
     known = ", ".join(plan.asked for plan in plans.values())
     raise RunError(
         f"{job.run.plan}: no plan for {quality_title(quality)} {target:g}, only for {known}; "
-        "run `sagesplat plan` with --force"
+        f"run `sagesplat plan {job.run.path} --target-{quality} {target:g} --force`"
     )
 
 

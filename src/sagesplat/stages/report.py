@@ -8,10 +8,11 @@ from sagesplat.core.events import RunDone
 from sagesplat.formats.ply import read_ply
 from sagesplat.output.tables import MB, bytes_of, last_counts, mean
 from sagesplat.run.job import Job
+from sagesplat.run.records import is_made_from
 from sagesplat.run.stage import run_stage
 from sagesplat.stages.methods import method_of
 from sagesplat.stages.noticed import noticed
-from sagesplat.stages.plan import main_target, scene_plan
+from sagesplat.stages.plan import main_plan, main_target, scene_plan
 from sagesplat.stages.results import budget_plan_of, evaluation_of
 
 
@@ -24,6 +25,9 @@ def make_report(job: Job, url: str = "") -> None:
     if url and (urlsplit(url).scheme not in ("http", "https") or not urlsplit(url).netloc):
         raise RunError(f"--url {short(repr(url))}: no address; give one such as https://example.org/place/")
     run, found = job.run, noticed(job)
+    for stage in ("compose", "evaluate"):
+        if not is_made_from(run, stage, run.plan):
+            raise RunError(f"{run.path}: planned anew; run `sagesplat {stage} {run.path}` before the report")
 
     def make() -> list[str]:
         quality, target = main_target(run)
@@ -44,8 +48,8 @@ def make_report(job: Job, url: str = "") -> None:
 
 
 def _outcome(job: Job) -> str:
-    """A run in one line: bytes, and quality at views that nothing was fitted to."""
-    plan = scene_plan(job, *main_target(job.run))
+    """What a run composes in one line: bytes, and quality at views that nothing was fitted to."""
+    plan = main_plan(job)
     sizes = method_of(job).bytes_to_send
     nbytes, counts = sum(map(bytes_of, plan.choices)), last_counts(job.ladder.counts)
     if sizes:
