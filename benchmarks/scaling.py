@@ -66,6 +66,8 @@ def read(path: Path) -> Bundle:
     files, visits = one["files"], [(i, visit) for i, p in enumerate(one["profiles"]) for visit in p["visits"]]
     kinds = np.array([list(KINDS).index(file["kind"]) for file in files])
     page = np.array([file["uri"].startswith("assets/") for file in files])
+    # not so: index.html, poster.jpg, manifest.json
+    hashed = (kinds >= list(KINDS).index("promises")) | page
     sizes = np.array([file["bytes"] for file in files])
     requests, sent, first = np.zeros((3, len(visits), len(files)))
     for row, (i, visit) in enumerate(visits):
@@ -82,8 +84,7 @@ def read(path: Path) -> Bundle:
         profile=np.array([i for i, _ in visits]),
         kinds=kinds,
         sizes=sizes,
-        hashed=(kinds >= list(KINDS).index("promises"))
-        | page,  # not so: index.html, poster.jpg, manifest.json
+        hashed=hashed,
         requests=requests,
         sent=sent,
         first=first,

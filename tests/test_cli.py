@@ -227,6 +227,8 @@ BEGIN, ADOPT = "begin with `sagesplat run SCENE RUN`", f"`sagesplat adopt {SPLAT
         (["view", SPLAT], f"{SPLAT}: no such folder; {ADOPT}"),
         (["bundle", CAPTURE, "new"], f"{CAPTURE}: not a run folder {NO_RUN}; {BEGIN}"),
         (["export", SPLAT, SPLAT], f"{SPLAT}: not a run folder {NO_RUN}; {ADOPT}"),
+        (["export", "a", "b", "--chunks", "spz", "--level", "2"], "b: --level does not go with --chunks"),
+        (["export", "a", "b", "--chunks", "spz", "--target-ssim", "0.5"], "b: --target-ssim does not go"),
         (["transfer", RUN, CAPTURE], f"{CAPTURE}: not a run folder {NO_RUN}; {BEGIN}"),
         (["compare", CAPTURE], f"{CAPTURE}: not a run folder {NO_RUN}; {BEGIN}"),
     ],

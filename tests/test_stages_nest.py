@@ -26,6 +26,7 @@ from sagesplat.formats.levels import write_set
 from sagesplat.formats.ply import read_ply
 from sagesplat.formats.quantisation import in_buckets
 from sagesplat.formats.splats import num_lods, read_splat
+from sagesplat.output.tables import bytes_of
 from sagesplat.run.job import Job
 from sagesplat.run.run_dir import RunDir
 from sagesplat.scene.images import Photos
@@ -37,7 +38,8 @@ from sagesplat.stages.export import export_scene
 from sagesplat.stages.methods import NestedLevels
 from sagesplat.stages.pipeline import run_all
 from sagesplat.stages.plan import make_plan
-from sagesplat.stages.report import make_report
+from sagesplat.stages.report import _outcome, make_report
+from sagesplat.stages.results import budget_plan_of, evaluation_of
 from sagesplat.stages.shared import observed
 from sagesplat.studies.paper.cross_view import read_cross_view
 from sagesplat.studies.paper.run import cross_views
@@ -550,9 +552,17 @@ def test_an_unknown_category_is_told_before_a_plan_is_given_up(finished: Path, t
 def test_a_report_is_of_what_was_composed_and_measured(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "run")
     job = job_of(tmp_path / "run", force=True)
-    make_plan(job, PlanConfig(target_fidelity=0.5))
+    make_plan(job, PlanConfig(budget=2000.0, budget_unit="count"))
     with pytest.raises(RunError, match=r"planned anew; run `sagesplat compose .*run` before the report"):
         make_report(job)
     compose_plan(job)
     with pytest.raises(RunError, match=r"planned anew; run `sagesplat evaluate .*run` before the report"):
         make_report(job)
+    evaluate_plans(job)
+    plan = budget_plan_of(job)
+    assert plan is not None
+    size = f"{sum(map(bytes_of, plan.choices)) / 1e6:.2f} MB of"
+    rows = evaluation_of(job).of(plan)
+    measured = f"SSIM {rows.ssim[rows.label_id == TOTAL].mean():.3f}"
+    assert _outcome(job).startswith(size)
+    assert measured in _outcome(job)
